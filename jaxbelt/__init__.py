@@ -13,24 +13,24 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     numerics/       spacing widths programs compiling
     checks          arguments, checked at the public edge
     tables          results as tables
-    numerics/       derivatives extrapolation newton continuation roots
+    numerics/       padding derivatives extrapolation newton continuation roots
+    numerics/       control_points
     model/          friction forcing oscillator own_units machine parameters variations modes
     model/          pseudofocus transitions instants rest events equilibria far_out
     presets         the published systems
-    kernel/         lanes marks step events rounds
+    kernel/         lanes marks step events rounds waves clocked
     motion/         integrators arcs flights sensitivities sampling loops batches timed runs
     motion/         smoothing simulate
     cycles/         chains settling shooting clocked periodic exponents orbits cycle
     cycles/         attractors functionals
-    cycles/         backwards returns creeping separatrices portrait unstable
+    cycles/         backwards returns separatrices portrait unstable
     cycles/         outlines nearest sides shocks
-    sweeps/         observers moments along reducers attractor queue threads audit
+    sweeps/         observers moments along reducers attractor exponents queue threads audit
     sweeps/         grid datasets question locks store progress work clusters sweep shares basins
     sweeps/         fractions orbit_diagram
-    bifurcations/   special labels systems guesses base conditions forced tangencies crossings
-    bifurcations/   rests
-    bifurcations/   edge_rests edges folds meetings connections infinity path scan refine tracks
-    bifurcations/   curves cells faces bounds regions branches diagrams switch_folds
+    bifurcations/   special labels beside systems guesses base conditions forced tangencies
+    bifurcations/   crossings rests edge_rests edges folds meetings connections infinity path scan
+    bifurcations/   refine tracks curves cells faces bounds regions branches diagrams switch_folds
     inverse/        selection record search fit margins design
     si              results in SI units
     plotting/       style phase histories forced points diagrams regions categories sweeps orbits

@@ -116,7 +116,7 @@ def critical_values() -> tuple[CriticalValue, ...]:
         wanted = {row: CONDITIONS[system, row.point] for row in rows}
         velocity = varied(osc, _nu0, ())
         for row in rows:
-            point = wanted[row].found_from(velocity, row.printed + AWAY)
+            point = wanted[row].named_point_from(velocity, row.printed + AWAY)
             if point is None or point.condition != wanted[row]:
                 values[row] = CriticalValue(*row, math.nan, math.nan, 0, None)
                 continue

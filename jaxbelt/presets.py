@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from .checks import is_concrete, require
-from .model.friction import Conti
+from .model.forcing import Harmonic
+from .model.friction import Conti, Coulomb, Cubic
 from .model.oscillator import Belt, Oscillator
 
 DAMPING = 0.5
@@ -108,6 +109,55 @@ def class_d(nu0: ArrayLike, nu1: ArrayLike, sigma0: ArrayLike, sigma1: ArrayLike
         Belt(nu1, paper_friction(), lower=sigma0),
     )
     return Oscillator(DAMPING, belts)
+
+
+def den_hartog(
+    frequency: ArrayLike,
+    amplitude: ArrayLike = 1.0,
+    friction: ArrayLike = 0.4,
+    damping: ArrayLike = 0.05,
+) -> Oscillator:
+    """Den Hartog's oscillator: a forced mass on a surface at rest, with Coulomb's friction.
+
+    x'' + damping x' + x = amplitude cos(frequency tau) - friction sgn(x'). See J. P. Den Hartog,
+    Forced vibrations with combined Coulomb and viscous friction, Trans. ASME 53 (1931) APM-107.
+
+    Args:
+        frequency: Angular frequency of the force in the time tau, where that of the mass is 1.
+        amplitude: Of the force, over the stiffness.
+        friction: Friction force over the stiffness, static and kinetic.
+        damping: c / sqrt(k m).
+
+    Returns:
+        The oscillator: one belt of velocity 0.
+
+    Example:
+        osc = jb.presets.den_hartog(frequency=0.5)
+    """
+    belt = Belt(0.0, Coulomb(static=1.0, kinetic=1.0), load=friction)
+    return Oscillator(damping, (belt,), forcing=Harmonic(amplitude, frequency))
+
+
+def di_bernardo(frequency: ArrayLike, amplitude: ArrayLike = 0.1) -> Oscillator:
+    """The oscillator of di Bernardo, Kowalczyk and Nordmark, with its route to chaos by sliding.
+
+    y'' + y = f(1 - y') + amplitude cos(frequency tau), f(r) = 1.5 sgn r - 1.5 r + 0.45 r^3: without
+    damping, on a belt of velocity 1 with a cubic law. See M. di Bernardo, P. Kowalczyk and A.
+    Nordmark, Sliding bifurcations: a novel mechanism for the sudden onset of chaos in dry friction
+    oscillators, Int. J. Bifurcation Chaos 13 (2003) 2935-2948.
+
+    Args:
+        frequency: Angular frequency of the force in the time tau; around 1.7 in the paper.
+        amplitude: Of the force, over the stiffness.
+
+    Returns:
+        The oscillator.
+
+    Example:
+        osc = jb.presets.di_bernardo(frequency=1.7077)
+    """
+    belt = Belt(1.0, Cubic(a0=1.5, a1=1.5, a3=0.45))
+    return Oscillator(0.0, (belt,), forcing=Harmonic(amplitude, frequency))
 
 
 class PublishedValue(NamedTuple):

@@ -120,7 +120,8 @@ ADVICE = {
         "Not everything is known: in the gaps there may be cycles (a continuum of closed orbits, "
         "cycles about to merge, orbits that settle too slowly), or a separatrix is missing, of a "
         "node on a contact edge, or is unsettled, or was not followed far enough for the shock "
-        "asked for. Move away from the bifurcation point."
+        "asked for; or, of a point, a search was left before it had looked into the interval "
+        "around it. Move away from the bifurcation point, or ask of a shorter span."
     ),
     Status.NEUTRAL: (
         "The orbit closes, and so do those beside it, as around a centre: no cycle that attracts, "

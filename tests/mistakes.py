@@ -40,6 +40,14 @@ TRACED = r" must be known: \w+ is not for jit, vmap or derivatives, got a traced
 #: What is called, and a pattern of the message; what begins with "jaxbelt" is a command.
 MISTAKES = [
     # --- friction laws, belts, oscillators
+    ("jb.Cubic(-1.0, 1.0, 1.0)", r"a0 of Cubic must be >= 0, got -1\.0"),
+    ("jb.Harmonic(1.0)", "missing 1 required positional argument: 'frequency'"),
+    ("jb.Harmonic(1.0, -1.0)", r"frequency of Harmonic must be >= 0, got -1\.0"),
+    ("jb.BaseMotion(math.nan, 1.0)", "amplitude of BaseMotion must be finite, got nan"),
+    ("jb.Oscillating(0.0, 1.0, 'a')", "frequency must be a number, got 'a'"),
+    ("jb.Belt(0.1, law, load=jb.Oscillating(1.0, 2.0, 1.0))", r"mean of load of belt must be >= "),
+    ("jb.Oscillator(0.1, (belt,), forcing=1.0)", "forcing must be a force such as jb.Harmonic"),
+    ("jb.portrait(jb.presets.di_bernardo(1.7))", "osc must be without a clock: portrait is for"),
     ("jb.Conti(1.0)", "missing 2 required positional arguments: 'residual' and 'steepness'"),
     ("jb.Conti('a', 0.6, 10.0)", "static must be a number, got 'a'"),
     ("jb.Conti(-1.0, 0.6, 10.0)", r"static of Conti must be >= 0, got -1\.0"),

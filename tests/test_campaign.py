@@ -302,7 +302,7 @@ def test_a_campaign_that_is_stopped_goes_on(swallows, monkeypatch, tmp_path, cap
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("derivatives --by find_cycle", "derivatives are asked of simulate or sweep"),
+        ("grazing --regime many", "--regime: grazing does not know it"),
         ("final --by sweep", "--by: final does not know it"),
         ("maps --seed 3", "--seed: maps does not know it"),
         ("paths --threads 2", "--threads: paths does not know it"),

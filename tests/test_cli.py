@@ -18,13 +18,7 @@ import jaxbelt as jb
 from jaxbelt import paper as reproduce
 from jaxbelt.cli import app
 from jaxbelt.commands.map import write_table
-from jaxbelt.commands.options import (
-    belts_of_class,
-    function_of_axes,
-    oscillator,
-    parameters,
-    parse_belt,
-)
+from jaxbelt.commands.options import Description, parse_belt
 from jaxbelt.commands.sweep import VARIABLES
 from jaxbelt.model.parameters import names_of
 from jaxbelt.sweeps.question import Question
@@ -86,7 +80,7 @@ def test_simulate_takes_belts_in_full(tmp_path):
 
 def test_classes_are_those_of_the_presets():
     def belts(system, **given):
-        return repr(belts_of_class(system, given))
+        return repr(Description(system, **given).oscillator().belts)
 
     assert belts("a", nu0=0.1) == repr(jb.presets.class_a(0.1).belts)
     assert belts("c", nu0=0.1, nu1=-0.2, sigma=0.3) == repr(
@@ -119,8 +113,8 @@ def own(nu0, load, damping=0.4):
 @pytest.mark.parametrize("system", ["a", "b", "c", "d", OWN])
 def test_parameters_are_those_of_the_oscillator(system):
     """Told without the oscillator, before anything that computes is imported."""
-    description = (system, None) if system in list("abcd") else ("b", system)
-    osc, known = oscillator(*description), parameters(*description)
+    described = Description(system) if system in list("abcd") else Description(belt=system)
+    osc, known = described.oscillator(), described.parameters()
     assert set(known.values()) == set(names_of(osc))
     assert [name for name in known if known[name] != name] == [
         *(f"nu{i}" for i in range(len(osc.belts))),
@@ -131,16 +125,15 @@ def test_parameters_are_those_of_the_oscillator(system):
 def test_axes_by_name():
     """Of a class its arguments, then anything by its path; dataset.attrs["call"] can be run."""
     axes = {"nu0": 0.2, "belts[1].load": 0.7}
-    make = function_of_axes("b", {}, OWN, 0.4, 1.1, axes)
+    make = Description(belt=OWN, damping=0.4, omega=1.1).along(axes)
     assert repr(make(**axes)) == repr(own(0.2, 0.7))
     assert repr(make(damping=0.3, nu0=0.2)) == repr(make(zeta=0.3, nu0=0.2))
     assert float(make(zeta=0.3).damping) == 0.3
-    assert function_of_axes("b", {}, None, 0.5, 1.0, ["nu0", "nu1"]) is jb.presets.class_b
-    edge = function_of_axes("c", {"nu1": -0.2}, None, 0.5, 1.0, ["sigma"])
+    assert Description().along(["nu0", "nu1"]) is jb.presets.class_b
+    edge = Description("c", nu1=-0.2).along(["sigma"])
     assert repr(edge(sigma=0.3)) == repr(jb.presets.class_c(0.2, -0.2, 0.3))
-    steep = function_of_axes(
-        "c", {"nu1": -0.2}, None, 0.3, 1.0, ["sigma", "belts[0].friction.steepness"]
-    )
+    named = ["sigma", "belts[0].friction.steepness"]
+    steep = Description("c", nu1=-0.2, damping=0.3).along(named)
     osc = steep(**{"sigma": 0.3, "belts[0].friction.steepness": 8.0})
     first, second = jb.presets.class_c(0.2, -0.2, 0.3).belts
     first = jb.Belt(first.velocity, jb.Conti(1.0, 0.6, 8.0), upper=0.3)

@@ -1,5 +1,9 @@
 """How functions are compiled: the same results in and out of traces, and nothing needlessly."""
 
+import functools
+import os
+import threading
+
 import equinox.internal
 import jax
 import jax.experimental.xla_metadata
@@ -11,7 +15,8 @@ from compilations import compilations
 from jax import lax
 
 import jaxbelt as jb
-from jaxbelt.numerics import compiling
+from jaxbelt.model.own_units import in_own_units
+from jaxbelt.numerics import compiling, programs
 
 #: Whether the tricks are used, which are those of the CPU's compiler.
 TRICKS = jax.default_backend() == "cpu" and not compiling.PLAIN
@@ -56,6 +61,93 @@ def test_runs_with_other_numbers_of_events_compile_nothing():
         second = jb.simulate(osc, (3.0, 0.0), 30.0, max_segments=4096)
     assert second.events.t.size < first.events.t.size
     assert compiled == []
+
+
+#: Calls, and others that differ from them in numbers only: these compile nothing.
+SAME_PROGRAM = {
+    "simulate, another length of ts, with and without t1": (
+        lambda: jb.simulate(CLASS_B, (3.0, 0.0), 40.0, ts=np.linspace(0.0, 40.0, 101)),
+        lambda: jb.simulate(OTHER, (1.0, 0.5), 38.0, ts=np.linspace(0.0, 36.0, 113)),
+    ),
+    "simulate, another t1": (
+        lambda: jb.simulate(CLASS_B, (3.0, 0.0), 40.0),
+        lambda: jb.simulate(OTHER, (1.0, 0.5), 51.0, rtol=1e-9),
+    ),
+    "find_cycle, another oscillator and start": (
+        lambda: jb.find_cycle(CLASS_B, (3.0, 0.0)),
+        lambda: jb.find_cycle(OTHER, (1.0, 0.5)),
+    ),
+    "sweep, another start, size and span": (
+        lambda: swept(9, (3.0, 0.0)),
+        lambda: swept(14, (1.0, 0.5)),
+    ),
+}
+CLASS_B, OTHER = jb.presets.class_b(0.45, 0.35), jb.presets.class_b(0.41, 0.3)
+
+
+ALONG_NU0 = functools.partial(jb.presets.class_b, nu1=0.35)
+
+
+def swept(count, y0):
+    axes = {"nu0": np.linspace(0.1, 0.1 * count, count)}
+    return jb.sweep(ALONG_NU0, axes, y0=y0, t1=20.0 + count, observe="final")
+
+
+@pytest.mark.parametrize("name", SAME_PROGRAM)
+def test_numbers_decide_no_program(name):
+    first, second = SAME_PROGRAM[name]
+    first()
+    with compilations() as compiled:
+        second()
+    assert compiled == []
+
+
+@pytest.mark.parametrize("end", [40.0, 39.0])
+def test_padded_times_are_those_that_were_asked_for(end):
+    ts = np.linspace(0.0, end, 37)
+    found = jb.simulate(CLASS_B, (3.0, 0.0), 40.0, ts=ts)
+    # In a trace the times are not padded.
+    unpadded = jax.jit(lambda y0: jb.simulate(CLASS_B, y0, 40.0, ts=ts))(np.array([3.0, 0.0]))
+    np.testing.assert_array_equal(found.ts, ts)
+    # Samples are flown from one to the next, in pieces that may begin at other ones.
+    np.testing.assert_allclose(found.ys, unpadded.ys, rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(found.modes, unpadded.modes)
+    if end == 40.0:
+        last = jb.simulate(CLASS_B, (3.0, 0.0), 40.0).ys[-1]
+        np.testing.assert_array_equal(found.ys[-1], last)
+
+
+def test_bounds_at_infinity_are_no_numbers_of_programs():
+    own = in_own_units(CLASS_B)
+    assert len(jax.tree.leaves(own.belts)) == len(jax.tree.leaves(CLASS_B.belts)) - 4
+    edged = jb.presets.class_c(0.45, 0.35, sigma=0.5)
+    assert len(jax.tree.leaves(in_own_units(edged).belts)) == len(jax.tree.leaves(edged.belts))
+    # What comes back has them, as arrays.
+    cycle = jb.find_cycle(CLASS_B, (3.0, 0.0))
+    assert jax.tree.structure(cycle.oscillator) == jax.tree.structure(CLASS_B)
+
+
+def test_what_is_compiled_beside_is_asked_for_once(monkeypatch, tmp_path):
+    monkeypatch.setattr(programs, "ON", True)
+    monkeypatch.setenv("JAXBELT_CACHE_DIR", str(tmp_path))
+    for cached in (programs._usable_folder, programs.are_kept):
+        cached.cache_clear()
+    monkeypatch.setattr(compiling, "_begun_beside", set())
+    called = []
+
+    def fails():
+        called.append("fails")
+        raise ValueError("no such thing")
+
+    for like in (jnp.ones(2), jnp.ones(3), {"x": jnp.ones(2)}):
+        begun = threading.Event()
+        calls = [fails, lambda begun=begun: (called.append("second"), begun.set())]
+        with compiling.compiled_beside("test", like, calls):
+            begun.wait(5 if not isinstance(like, jax.Array) or not called else 0)
+    for cached in (programs._usable_folder, programs.are_kept):
+        cached.cache_clear()
+    expected = [] if compiling.PLAIN or os.cpu_count() == 1 else ["fails", "second"] * 2
+    assert called == expected
 
 
 class Constant(jb.Coulomb):

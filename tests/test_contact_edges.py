@@ -324,7 +324,7 @@ def test_a_small_cycle_that_sticks_until_the_edge():
     points = jb.scan(osc, nu0, (0.165, 0.18), resolution=8)
     assert [point.condition for point in points] == [jb.SlidingExchange((0, 1))]
     path = ParameterPath(osc, nu0, (0.165, 0.18))
-    path.look([0.17, 0.178])
+    path.find_labels([0.17, 0.178])
     for nu, belt in ((0.17, 0), (0.178, 1)):
         label = path.label(nu)
         assert len(label.cycles) == 2 and label.events(EventKind.STICK)[belt] > 0

@@ -67,7 +67,8 @@ def errors(curve, osc, where, condition, rows):
         free = int(np.argmin(np.abs(chord)))
         held = both.held(1 - free, float(values[1 - free]))
         solved = [
-            condition.found_from(held, float(values[free]) + offset) for offset in (-1e-3, 1e-3)
+            condition.named_point_from(held, float(values[free]) + offset)
+            for offset in (-1e-3, 1e-3)
         ]
         points = [point for point in solved if point is not None]
         assert curve.kinds[row] in {point.kind for point in points}
@@ -375,13 +376,13 @@ def special_along(watched):
         def corrected(self, u, tangent, length):
             return Corrected(np.asarray(u) + length * np.asarray(tangent), tangent, 1, 1.0, True)
 
-        def look(self, u):
+        def seen_at(self, u):
             return Seen({name: one(u[-2]) for name, one in watched.items()}, True, np.nan, 0.0)
 
     nothing: Any = None
     track, tangent = Straight(nothing, nothing, nothing), np.array([1.0, 0.0])
     ends = [
-        (CurvePoint(np.array([nu, 0.1]), tangent, 1, None, 1.0), track.look([nu, 0.1]))
+        (CurvePoint(np.array([nu, 0.1]), tangent, 1, None, 1.0), track.seen_at([nu, 0.1]))
         for nu in (0.0, 1.0)
     ]
     return special_between(track, np.array([[-1.0, 1.0], [-1.0, 1.0]]), *ends)

@@ -206,7 +206,7 @@ def test_two_cycles_with_one_sequence_of_events():
     points = search(path)
     expected = [jb.SaddleConnection(1, to=1), jb.GrazingEdge(1), jb.Hopf(), jb.Hopf()]
     assert [point.condition for point in points] == expected
-    path.look([-0.06341])
+    path.find_labels([-0.06341])
     loops = [one.loop for one in path.cycles[-0.06341]]
     assert len({loop_events(loop) for loop in loops}) == 1
     assert sorted(np.sum(loop.durations) for loop in loops) == pytest.approx(
@@ -238,7 +238,7 @@ def test_an_orbit_that_still_grows_is_no_cycle():
     )
     osc = jb.Oscillator(0.05, belts, omega=0.5)
     path = ParameterPath(osc, lambda osc: osc.belts[1].velocity, (0.932, 0.935))
-    path.look([0.9333, 0.93331195])
+    path.find_labels([0.9333, 0.93331195])
     assert [len(path.cycles[value]) for value in (0.9333, 0.93331195)] == [1, 1]
 
 
@@ -266,7 +266,7 @@ def test_nested_cycles_in_one_mode():
         oracle_cycles.fold_of_cycles(make, (0.5045, 0.5065), (0.3, 0.45)),
     )
     assert values_of(points) == pytest.approx(expected, abs=1e-9)
-    path.look([0.4975, 0.5, 0.5075])
+    path.find_labels([0.4975, 0.5, 0.5075])
     amplitudes = [
         [float(np.ptp(one.loop.entries[:, 0])) / 2 for one in path.cycles[value]]
         for value in (0.4975, 0.5, 0.5075)
@@ -387,6 +387,59 @@ def test_a_change_that_no_condition_explains_is_reported():
     assert point.value == pytest.approx(0.5, abs=1e-9)  # known to 1e-9 of the span
     told = f"BifurcationPoint(Unexplained(), value {float(point.value):.12g}, error < "
     assert repr(point).startswith(told) and "Simulate on both sides" in repr(point)
+    # All that moves there goes on.
+    assert [len(side.cycles) for side in point.sides] == [0, 0]
+    assert point.sides[0].value < 0.5 < point.sides[1].value
+
+
+class Gauss(jb.AbstractFriction):
+    """mu(r) = 1 + 0.5 exp(-(r/speed)^2) + 0.4 r, in m/s."""
+
+    speed: jax.Array
+
+    @property
+    def static(self):
+        return jnp.asarray(1.5)
+
+    def mu(self, r):
+        return 1 + 0.5 * jnp.exp(-((r / self.speed) ** 2)) + 0.4 * r
+
+
+@pytest.mark.slow
+def test_a_fold_squeezed_together_with_a_canard_is_told_by_how_its_branches_end():
+    """By bisection with two engines stick-slip ends at 0.1879264811 m/s."""
+    law = Gauss(jnp.asarray(0.001))
+    machine = jb.Machine(1.0, 2.0, 0.0, (jb.PhysicalBelt(0.188, law, 1.0),))
+    osc, per = machine.oscillator, float(machine.oscillator.belts[0].velocity) / 0.188
+
+    def where(osc):
+        return osc.belts[0].velocity
+
+    (point,) = jb.scan(osc, where, (0.15 * per, 0.25 * per), resolution=16)
+    assert point.kind == "Unexplained"
+    assert point.value / per == pytest.approx(0.1879264811, abs=2e-10)
+    below, above = point.sides
+    (cycle,) = below.cycles
+    assert not above.cycles and "STICK 0 SLIP 0" in repr(point)
+    # It still sticks for a quarter of its period; the loop that parts it from rest is close by.
+    assert cycle.stick_durations[0] > 1.5 and cycle.multiplier == 0
+    (jump,), (inside,) = below.jumps, below.inside
+    assert 0.4 < jump < 0.6 and 0 < inside < 1e-4
+    found = jb.refine(jb.NonsmoothFold(0), osc, where=where)
+    assert found.status != Status.OK and len(found.sides[0].cycles) == 1
+
+
+@pytest.mark.slow(first=True)
+def test_a_search_that_is_left_says_so(monkeypatch):
+    monkeypatch.setattr("jaxbelt.bifurcations.scan.MOST_ATTEMPTS", 0)
+    osc = jb.presets.class_b(0.45, 0.35)
+    with pytest.warns(UserWarning, match="was not looked into in"):
+        points = jb.scan(osc, lambda osc: osc.belts[0].velocity, (0.1, 0.7), resolution=24)
+    left = [point for point in points if point.status == Status.INCOMPLETE]
+    # The intervals have all that it did not come to, and what it has is kept.
+    for value in (0.263654916039, 0.538734800481):
+        assert any(abs(point.value - value) <= point.error for point in left)
+    assert any(point.status == Status.OK for point in points)
 
 
 @pytest.mark.slow(first=True)

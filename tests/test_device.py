@@ -194,15 +194,14 @@ def slopes():
 
 
 def cycles():
-    def of(nu):
+    def period(nu):
         cycle = jb.find_cycle(jb.presets.class_b(nu, NU1), (3.0, 0.0))
-        slope = jax.grad(
-            lambda nu: jb.period(jb.find_cycle(jb.presets.class_b(nu, NU1), (3.0, 0.0)))
-        )(nu)
-        return cycle.period, cycle.status, slope
+        return jb.period(cycle), cycle.status
 
-    period, status, slope = jax.jit(jax.vmap(of))(jnp.linspace(0.1, 0.6, 70))
-    return {"period": period, "status": status, "d_period": slope}
+    # More than a group on the CPU has.
+    nus = jnp.linspace(0.1, 0.6, 70)
+    (found, status), slope = jax.jit(jax.vmap(jax.value_and_grad(period, has_aux=True)))(nus)
+    return {"period": found, "status": status, "d_period": slope}
 
 
 def unstable_cycles():
@@ -244,7 +243,7 @@ first = pytest.mark.slow(first=True)
         pytest.param(lambda: sweep("attractor", class_d), id="attractors", marks=first),
         pytest.param(ends, id="ends", marks=first),
         pytest.param(slopes, id="slopes", marks=first),
-        pytest.param(cycles, id="cycles", marks=first),
+        pytest.param(cycles, id="cycles", marks=pytest.mark.slow),
         pytest.param(unstable_cycles, id="unstable", marks=pytest.mark.slow),
         pytest.param(scanned, id="scan", marks=pytest.mark.slow),
         pytest.param(mapped, id="regions", marks=pytest.mark.slow),
@@ -366,15 +365,16 @@ def test_operations_of_a_lane_are_those_that_were_written():
 
 
 @needs_cpu
+@pytest.mark.slow(first=True)
 def test_the_script_measures_at_small_sizes(script):
-    code, found = script("--parts", "w1", "--w1", "100")
+    code, found = script("--parts", "w1", "--w1", "900")
     assert code == 0, found
     told = found["w1"]
-    assert told["runs"] == 100 and told["right"] and 15 < told["events a run"] < 25
-    # Some steps for each of 100 units of time.
+    assert told["runs"] == 900 and told["right"] and 15 < told["events a run"] < 25
+    # Some steps for each of 100 units of time; of 1,024 lanes some are idle from the start.
     assert 100 < told["kernel: steps of a lane a run"] < 1000
     assert told["kernel: bound by"] in ("float64 operations", "memory")
-    assert 0 < told["kernel: share of the bound"] < 2  # on a busy machine, measured one by one
+    assert 0 < told["kernel: share of float64 operations"] <= told["kernel: share of the bound"]
 
 
 @needs_cpu

@@ -21,7 +21,12 @@ DOCS = Path(__file__).parents[1] / "docs"
 GIVEN = {"jax": jax, "jnp": jnp, "np": np, "plt": plt, "jb": jb}
 PAGES = {
     path.stem: path
-    for path in [*DOCS.glob("api/*.md"), *DOCS.glob("bifurcations/*.md"), DOCS / "laws.md"]
+    for path in [
+        *DOCS.glob("api/*.md"),
+        *DOCS.glob("bifurcations/*.md"),
+        DOCS / "laws.md",
+        DOCS / "forcing.md",
+    ]
 }
 #: What these compile, few other tests need.
 SLOW = """

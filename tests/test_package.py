@@ -240,5 +240,6 @@ def test_every_public_name_has_its_place_in_the_reference():
         )
     )
     classes = {name for name in vars(jaxbelt.presets) if name.startswith("class_")}
+    classes |= {"den_hartog", "di_bernardo"}
     presets = {f"presets.{name}" for name in classes}
     assert shown == Counter({*jaxbelt.__all__, *presets} - {"presets"})

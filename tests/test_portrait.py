@@ -14,7 +14,7 @@ import scipy.linalg
 from scipy.integrate import solve_ivp
 
 import jaxbelt as jb
-from jaxbelt.cycles.outlines import outline_of_separatrix
+from jaxbelt.cycles.outlines import OpenOutline
 from jaxbelt.cycles.returns import _next_tops
 from jaxbelt.motion.arcs import Ends
 from tests.campaign import engine, package, portraits
@@ -260,7 +260,7 @@ def test_an_edge_cuts_off_what_only_the_static_limit_holds(sign):
     (one,) = [one for one in told.separatrices if tuple(np.asarray(one.point)) == corner]
     assert one.stable and one.end == "outside"
     # As shocks follow it, backwards from its point.
-    pieces = outline_of_separatrix(told.oscillator, one).pieces(told.oscillator)
+    pieces = OpenOutline.of(told.oscillator, one).pieces(told.oscillator)
     np.testing.assert_array_equal(pieces.entries[0], [corner[0], -corner[1]])
 
 

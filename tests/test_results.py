@@ -28,6 +28,7 @@ from jaxbelt.plotting.style import parameter_label
 #: Public classes that are no results: what a user writes down.
 NO_RESULTS = {
     *(jb.AbstractFriction, jb.Conti, jb.Coulomb, jb.Stribeck, jb.Tabulated),
+    *(jb.Cubic, jb.AbstractForce, jb.Harmonic, jb.BaseMotion, jb.Oscillating),
     *(jb.Belt, jb.Oscillator),
     *(jb.Machine, jb.PhysicalBelt, jb.Units),
     *(jb.AtEvents, jb.AtExtrema, jb.AtSection, jb.AtTimes),

@@ -1,16 +1,16 @@
-"""What every bifurcation condition is: `AbstractCondition`, and the `BifurcationPoint` it leads to.
+"""The base of all bifurcation conditions, `AbstractCondition`, and its result, `BifurcationPoint`.
 
 A condition is one more equation, in one more unknown: the parameter. It is written so that the
-whole system is regular at the point, which "stick duration of the cycle = 0" is not: solved for
-the cycle at every parameter, the duration goes like a square root and Newton's method fails. In the
+whole system is regular at the point, which "stick duration of the cycle = 0" is not: solved for the
+cycle at every parameter, the duration goes like a square root and Newton's method fails. In the
 unknowns of fixed-signature shooting (see `cycles`) the same equation is harmless.
 
-Each kind is one class that carries all that is known of it: its theory; a guess and the system of
-equations that Newton's method solves from there, which also judges the solution; what hints at it
-between two values on a path; what to watch along its curve, and where that ends; its names and its
-line in pictures. `refine`, `scan`, `bifurcation_curve`, the diagrams and the pictures ask it and
-know no kind. What conditions on a cycle have in common is in `conditions`, what those on a state of
-rest have in `rests`.
+Each kind is one class that carries everything about it: its theory; a guess and the system of
+equations that Newton's method solves from there, which also judges the solution; the signs of it
+between two values on a path; the functions to watch along its curve, and where that ends; its names
+and its line in pictures. `refine`, `scan`, `bifurcation_curve`, the diagrams and the pictures ask
+the condition and know no kind. What conditions on a cycle have in common is in `conditions`, what
+those on a state of rest have in `rests`.
 
 The numbers in a condition, such as its belt, are data of the compiled programs, so one program
 serves all of them: in `guess` and `system` they are arrays. A field that decides which program runs
@@ -39,6 +39,7 @@ from ..model.variations import Family, Variation
 from ..motion.arcs import Ends
 from ..results import Status, describe, draw
 from ..tables import require_single, table_of
+from .beside import Side
 from .labels import AttractingCycle, Label
 from .special import SpecialPoint, Trail
 from .systems import (
@@ -52,7 +53,7 @@ if TYPE_CHECKING:
     import pandas
 
 
-#: What the arguments of conditions are.
+#: Words for the arguments of conditions.
 ARGUMENTS = {
     "belt": " (the number of a belt, such as 0)",
     "belts": " (the numbers of two belts, such as (0, 1))",
@@ -60,8 +61,8 @@ ARGUMENTS = {
 
 
 class Line(NamedTuple):
-    """How the curves of a kind are drawn: its name in legends, a colour, a line style (plain data,
-    as Matplotlib takes it)."""
+    """Style of the curves of a kind: name in legends, colour, line style (as Matplotlib takes
+    it)."""
 
     name: str
     colour: str
@@ -80,22 +81,22 @@ def check_conditions(conditions: Any, field: str = "conditions") -> tuple["Abstr
 
 
 def check_two_belts(belts: Any) -> None:
-    """`ValueError` unless they are the numbers of two belts."""
+    """Raises a `ValueError` unless `belts` are the numbers of two belts."""
     two = isinstance(belts, tuple | list) and len(set(belts)) == len(belts) == 2
     require_value(two, "belts", "two different numbers, such as (0, 1)", belts)
 
 
 class AbstractCondition(eqx.Module):
-    """What is to happen at a bifurcation point."""
+    """A condition that holds at a bifurcation point."""
 
-    #: What is said of a point in a diagram, with {belt} for the number of the belt; "": the name of
-    #: the class.
+    #: Caption of a point in a diagram, with {belt} for the number of the belt; "": name of the
+    #: class.
     caption: ClassVar[str] = ""
-    #: How its curves are drawn; with the name of the class where its name is "".
+    #: Style of its curves; the name is that of the class where it is "".
     line: ClassVar[Line] = Line("", "black", (0, (1, 1)))
-    #: The name of what stays the same along a curve on which the kind changes; "": its own.
-    family: ClassVar[str] = ""
-    #: Whether orbits beside a point are slow to settle, so that it is seen from farther off only.
+    #: Name of the group of kinds that one curve may change between; "": this kind alone.
+    group: ClassVar[str] = ""
+    #: Whether orbits beside a point converge slowly, so that it is seen from farther off only.
     slow: ClassVar[bool] = False
     #: Whether one guess may be near to several such points, in different arcs or of other cycles.
     has_several: ClassVar[bool] = False
@@ -103,7 +104,7 @@ class AbstractCondition(eqx.Module):
     joins: ClassVar[bool] = True
     #: Whether its curve ends where the signature changes.
     ends_at_contact: ClassVar[bool] = False
-    #: Whether its curve bends sharply before its limit, so that rows are wanted close to that.
+    #: Whether its curve bends sharply before its limit, so that rows are needed close to that.
     bends: ClassVar[bool] = False
 
     def __new__(cls, *args: Any, **given: Any):
@@ -120,44 +121,44 @@ class AbstractCondition(eqx.Module):
 
     @property
     def belts_concerned(self) -> tuple[int, ...]:
-        """The numbers of the belts that it is about: those in its field `belt`, or `belts`."""
+        """Numbers of the belts concerned: those in its field `belt`, or `belts`."""
         belt = getattr(self, "belt", None)
         return getattr(self, "belts", ()) if belt is None else (belt,)
 
     @property
     def lineage(self) -> tuple[str, tuple[int, ...]]:
-        """What stays the same along a curve: the name of the family, and the belts."""
-        return self.family or type(self).__name__, self.belts_concerned
+        """What stays the same along a curve: the name of the group, and the belts."""
+        return self.group or type(self).__name__, self.belts_concerned
 
     @property
     def words(self) -> str:
-        """What is said of a point in a diagram."""
+        """Caption of a point in a diagram."""
         caption = self.caption or type(self).__name__
         return caption.format(belt=" ".join(map(str, self.belts_concerned)))
 
     @property
     def sought(self) -> "AbstractCondition":
-        """The condition of whichever kind of its family; what is found is named afterwards."""
+        """The condition to solve where the kind shows only at the solution, see `named`."""
         return self
 
     def named(self, point: "BifurcationPoint") -> "AbstractCondition":
-        """What a point that was sought is."""
+        """The condition that holds at a solution of `sought`."""
         return self
 
     def is_slow_at(self, point: "BifurcationPoint") -> bool:
-        """Whether orbits beside this point are slow to settle."""
+        """Whether orbits beside this point converge slowly."""
         return self.slow
 
     def covers(self, point: "BifurcationPoint") -> bool:
-        """Whether a point that has a name is one of this condition."""
+        """Whether a named point is one of this condition."""
         other = point.condition
         is_pair = type(self) is type(other) and len(self.belts_concerned) == 2
         same_pair = is_pair and set(self.belts_concerned) == set(other.belts_concerned)
         return self == other or same_pair
 
     def check(self, osc: Oscillator) -> None:
-        """`ValueError` where the oscillator cannot meet it."""
-        # Of a field `belt` that is None, too.
+        """Raises a `ValueError` if the oscillator cannot meet the condition."""
+        # Also for a field `belt` that is None.
         belts = [vars(self)["belt"]] if "belt" in vars(self) else self.belts_concerned
         for belt in belts:
             check_belt(belt, len(osc.belts))
@@ -171,7 +172,7 @@ class AbstractCondition(eqx.Module):
         raise ValueError(f"condition must be {expected}, got {self!r}")
 
     def as_data(self) -> Any:
-        """The same with arrays for its numbers, as compiled programs take it."""
+        """The same condition with arrays for its numbers, as compiled programs take it."""
         return jax.tree.map(lambda leaf: jnp.asarray(np.array(leaf)), self)
 
     # --- a point ---
@@ -183,28 +184,28 @@ class AbstractCondition(eqx.Module):
 
     @abc.abstractmethod
     def guess(self, osc: Oscillator, size: int) -> Any:
-        """What its system of equations begins from, any tree; size: room for the arcs of a loop.
+        """The guess from which its system of equations begins, any tree.
 
-        It is asked of the condition as data, see `as_data`, and may be a loop of a cycle, a state
-        of rest, or what else `prepared` takes. Where there is nothing to begin from, the status of
-        `prepared` says so.
+        It is called on the condition as data, see `as_data`, and may return a loop of a cycle, a
+        state of rest, or whatever `prepared` takes. If there is nothing to begin from, the status
+        of `prepared` says so. size: room for the arcs of a loop.
         """
 
     @abc.abstractmethod
     def prepared(self, osc: Oscillator, guess: Any) -> tuple[AbstractSystem, Any, Array]:
         """The system near a guess, its unknowns there, and a status.
 
-        guess: what `guess` returned; osc: the oscillator there. The unknowns are what the system
-        takes as x; the status is OK, or says why there is no guess.
+        guess: what `guess` returned; osc: the oscillator there. The unknowns are the x of the
+        system; the status is OK, or says why there is no guess.
         """
 
     @abc.abstractmethod
-    def solved(
+    def point_near(
         self, family: Family, system: Any, x: Any, p: Any, status: Array
     ) -> tuple["BifurcationPoint", tuple[Any, Array]]:
         """The point near a guess (x, p) in a family of oscillators, and (x, p) there.
 
-        system, x, status: of `prepared`; p: the parameter, [1]. The condition of the point is
+        system, x, status: from `prepared`; p: the parameter, [1]. The condition of the point is
         `UNNAMED`; its status is that of `prepared` where that was not OK.
         """
 
@@ -216,12 +217,12 @@ class AbstractCondition(eqx.Module):
 
         def attempt(family, unknowns):
             x, p = unknowns
-            return self.solved(family, system, x, p, status)
+            return self.point_near(family, system, x, p, status)
 
-        point, settled = variation.settle(attempt, (x, value))
-        if settled is True:
+        point, agrees = variation.relinearised(attempt, (x, value))
+        if agrees is True:
             return point
-        fails = (point.status == Status.OK) & ~jnp.asarray(settled)
+        fails = (point.status == Status.OK) & ~jnp.asarray(agrees)
         numbers = ("value", "residual", "error", "multiplier")
         known = {name: jnp.where(fails, jnp.nan, getattr(point, name)) for name in numbers}
         status = jnp.where(fails, Status.NO_CONVERGENCE.value, point.status)
@@ -230,33 +231,33 @@ class AbstractCondition(eqx.Module):
     def point(
         self, variation: Variation, osc: Oscillator, value: Any, size: int
     ) -> "BifurcationPoint":
-        """The point near an oscillator, that at a value, [1], of what is varied."""
+        """The point near an oscillator, which is that at a value, [1], of the parameter."""
         data = self.as_data()
         return replace(data.solve(variation, osc, value, data.guess(osc, size)), condition=self)
 
-    def found_from(
+    def named_point_from(
         self, variation: Variation, value: float, beginning: Any = None
     ) -> "BifurcationPoint | None":
-        """The point that is found from that value of what is varied, or None.
+        """The point that is found from this value of the parameter, with its name, or None.
 
-        One of a family is named as what it is. beginning: one of `beginnings`.
+        beginning: one of `beginnings`.
         """
-        point = self.solved_from(variation, value, beginning)
+        point = self.point_from(variation, value, beginning)
         if int(point.status) != Status.OK:
             return None
         return replace(point, condition=self.sought.named(point))
 
-    def solved_from(
+    def point_from(
         self, variation: Variation, value: float, beginning: Any = None
     ) -> "BifurcationPoint":
-        """As `found_from`, without a name, whatever its status."""
+        """Like `named_point_from`, but without a name, and whatever the status."""
         data, start = self.sought.as_data(), np.array([value])
         osc = variation.oscillator(start)
         guess = data.guess(osc, data.room) if beginning is None else data.guess_near(beginning)
         return data.solve(variation, osc, start, guess)
 
     def guess_near(self, beginning: Any) -> Any:
-        """The guess, where the motion that it is about is known: one of `beginnings`."""
+        """The guess from a known motion: one of `beginnings`."""
         raise NotImplementedError
 
     # --- on a path ---
@@ -265,7 +266,7 @@ class AbstractCondition(eqx.Module):
     def between(
         cls, before: Label, after: Label, edged: Sequence[int]
     ) -> Sequence["AbstractCondition"]:
-        """Those of its kind that could make the difference between two labels.
+        """Conditions of this kind that could make the difference between two labels.
 
         edged: belts with a finite contact edge, one for each place.
         """
@@ -273,78 +274,90 @@ class AbstractCondition(eqx.Module):
 
     @classmethod
     def at_coincidence(cls, belts: tuple[int, ...]) -> Sequence["AbstractCondition"]:
-        """Those that could hold where a belt is at rest, or two run at one velocity."""
+        """Conditions that could hold where a belt is at rest, or two belts have one velocity."""
         return ()
 
     @classmethod
     def at_meeting(
         cls, belts: tuple[int, ...], before: Label, after: Label
     ) -> Sequence["AbstractCondition"]:
-        """Those that could make the difference where contact edges of two belts meet."""
+        """Conditions that could make the difference where contact edges of two belts meet."""
         return ()
 
     @classmethod
     def of_unstable_cycles(cls, edged: Sequence[int]) -> Sequence["AbstractCondition"]:
-        """Those that could make the difference between the modes of two unstable cycles."""
+        """Conditions that could make the difference between the modes of two unstable cycles."""
         return ()
 
     def mark(self, osc: Oscillator, cycles: Sequence[Loop]) -> Hashable:
-        """What changes where it holds, beside a label; cycles: the attracting ones, in order."""
+        """Value that changes where the condition holds, in addition to a label.
+
+        cycles: the attracting ones, in order.
+        """
         return None
 
     def beginnings(self, osc: Oscillator, cycles: Sequence[AttractingCycle]) -> Sequence[Any]:
-        """Of the motions there those to begin from, loops of the attracting cycles, say; None: its
-        own guess."""
+        """Motions to begin from, such as loops of the attracting cycles; None stands for its own
+        guess."""
         return (None,)
 
     def values(self, a: float, b: float) -> Sequence[float]:
-        """Where to begin, if it may hold between two values."""
+        """Values of the parameter to begin from, if the condition may hold between two values."""
         return a, b
 
     # --- along a curve ---
 
     @abc.abstractmethod
-    def followed(self, point: "BifurcationPoint") -> tuple[AbstractSystem, Any]:
-        """The system to be followed from a point, and its unknowns there."""
+    def system_at(self, point: "BifurcationPoint") -> tuple[AbstractSystem, Any]:
+        """The system to follow from a point, and its unknowns there."""
 
     def kind_along(self, osc: Oscillator, multiplier: float) -> type["AbstractCondition"]:
         """The kind that holds at a point of its curve."""
         return type(self)
 
     def limit(self, trail: Trail) -> SpecialPoint | None:
-        """What its curve ends in where there is no such motion, if that is near."""
+        """The point in which its curve ends where there is no such motion, if that is near."""
         return None
 
     def place(self, point: "BifurcationPoint") -> np.ndarray:
-        """Where the motion at a point is, see `place_of`; NaN where there is none."""
+        """Place of the motion at a point, see `place_of`; NaN where there is none."""
         return place_of(point.cycle) if int(point.cycle.status) == Status.OK else NOWHERE
 
     def type_of(self, point: "BifurcationPoint") -> str:
-        """Of a kind that has several types that of a point, "" where there is but one."""
+        """Type of a point, "" for a kind with one type."""
         return ""
 
     def coefficient(self, point: "BifurcationPoint") -> Array:
-        """Of a kind where a cycle is born the coefficient that tells which way."""
+        """For a kind at which a cycle is born: the coefficient whose sign decides on which side."""
         return jnp.asarray(jnp.nan)
 
     def orbit(self, point: "BifurcationPoint") -> np.ndarray | None:
-        """States of the motion at a point that is no cycle, [samples, 2]; None: there is none."""
+        """States of the motion at a point that is no cycle, [samples, 2]; None if there is none."""
         return None
 
 
 class BifurcationPoint(eqx.Module):
-    """What `refine` returns.
+    """A bifurcation point; what `refine` returns.
 
-    condition: the condition that holds there; value: of the parameter; residual: largest error in
-    the defining equations; iterations: Newton steps; steps: how far each went, NaN padded; error: a
-    bound on `|value - exact value|`, from the same equations with every integration step halved,
-    and rounding; oscillator: at the point;
-    cycle: at the point, with a status that says why where there is none (at a Hopf point it has
-    shrunk to the equilibrium, at `SuddenSliding` its period is infinite); multiplier: of the cycle
-    on the side where it does not stick to the belt, for `NonsmoothFold` and `GrazingSliding`, else
-    NaN; x1: where the mass is at rest at the point where its equations tell it, else NaN; status: a
-    `Status` code. Where it is not OK the value is NaN. member: which of several states of rest it
-    is, as its condition counts them.
+    Attributes:
+        condition: The condition that holds there.
+        value: Value of the parameter; NaN where the status is not OK, unless only the kind is
+            unknown.
+        residual: Largest error in the defining equations.
+        iterations: Number of Newton steps.
+        steps: Lengths of the Newton steps, NaN padded.
+        error: A bound on `|value - exact value|`, from the same equations with every integration
+            step halved, and rounding.
+        multiplier: For `NonsmoothFold` and `GrazingSliding`, multiplier of the cycle on the side
+            where it does not stick to the belt; else NaN.
+        x1: Displacement of the mass at rest, where the equations determine it; else NaN.
+        oscillator: The oscillator at the point.
+        cycle: The cycle at the point; its status says why, where there is none (at a Hopf point it
+            has shrunk to the equilibrium, at `SuddenSliding` its period is infinite).
+        status: A `Status` code.
+        member: Number of the state of rest, as its condition counts them.
+        sides: Where something changes that no condition explains, what there is below the value and
+            above it, two of `Side`; else ().
     """
 
     condition: AbstractCondition = eqx.field(static=True)
@@ -359,17 +372,18 @@ class BifurcationPoint(eqx.Module):
     cycle: Cycle
     status: Array
     member: ArrayLike = 0
+    sides: tuple[Side, ...] = ()
 
     @property
     def _own(self) -> "BifurcationPoint":
-        """In own units, in which its condition knows it."""
+        """The point in own units, in which its condition works."""
         own = in_own_units(self.oscillator)
         if own is self.oscillator:
             return self
         return rescaled(self, 1 / own.units.length, lambda _: own)
 
     def _back(self, value: Any, *dimensions: str) -> Any:
-        """What its condition says of `_own`, in the units of the point."""
+        """A result of the condition for `_own`, in the units of the point."""
         own = in_own_units(self.oscillator)
         return value if own is self.oscillator else own.units.back(value, *dimensions)
 
@@ -380,45 +394,46 @@ class BifurcationPoint(eqx.Module):
 
     @property
     def type(self) -> str:
-        """Which sort of its kind it is, "" where the kind has but one or no point was found.
+        """Type of the point within its kind.
 
-        "supercritical" or "subcritical" of `Hopf` and `PseudoHopf`: the cycle that is born attracts
-        or repels ("degenerate": the coefficient is zero, or the fixed point lies on a contact
-        edge, where there is none). "persistence" or "annihilation" of
+        "supercritical" or "subcritical" for `Hopf` and `PseudoHopf`: the cycle that is born
+        attracts or repels ("degenerate": the coefficient is zero, or the fixed point lies on a
+        contact edge, where there is none). "persistence" or "annihilation" for
         `BoundaryEquilibrium`: there is an equilibrium on both sides of the point, or two meet and
-        vanish ("degenerate": another one lies there, too). "crossing" or "buckling" of
-        `CrossingSliding`: a stick phase ceases to be there, or the boundary is crossed once more
-        before it ("jump": for long at once). "homoclinic" or "heteroclinic" of
-        `SaddleConnection`: it leads back to the same saddle or to another one.
+        vanish ("degenerate": another one lies there, too). "crossing" or "buckling" for
+        `CrossingSliding`: a stick phase ceases to exist, or the boundary is crossed once more
+        before it ("jump": for long at once). "homoclinic" or "heteroclinic" for `SaddleConnection`:
+        it leads back to the same saddle or to another one. "" where the kind has one type, or no
+        point was found.
         """
         require_single(self, self.value, 0)
         return self.condition.type_of(self._own) if int(self.status) == Status.OK else ""
 
     @property
     def coefficient(self) -> Array:
-        """The coefficient a of `Hopf` and `PseudoHopf`, else NaN, as at a fixed point on a contact
-        edge; with derivatives by parameters.
+        """The coefficient a of `Hopf` and `PseudoHopf`, with derivatives by parameters.
 
         The amplitude r of small oscillations, of x1 around a fixed point, of x2 at the edge around
         a pseudo-focus, obeys r' = rate r + a r^3, with the `rate` of `Equilibria`. So near the
-        point there is a cycle with r^2 = -rate/a, which attracts where a < 0.
+        point there is a cycle with r^2 = -rate/a, which attracts where a < 0. NaN for other kinds,
+        and at a fixed point on a contact edge.
         """
         found = self._back(self.condition.coefficient(self._own), "coefficient")
         return jnp.where(self.status == Status.OK, found, jnp.nan)
 
     @property
     def place(self) -> np.ndarray:
-        """Where the motion is, see `place_of`; NaN where there is none."""
+        """Place of the motion, see `place_of`; NaN where there is none."""
         return self._back(self.condition.place(self._own), *PLACE_DIMENSIONS)
 
     @property
     def orbit(self) -> np.ndarray | None:
-        """States of the motion at a point that is no cycle, [samples, 2]; None: there is none."""
+        """States of the motion at a point that is no cycle, [samples, 2]; None if there is none."""
         states = self.condition.orbit(self._own)
         return None if states is None else self._back(states, "length", "velocity")
 
     def row(self) -> dict[str, Any]:
-        """What `table` tells of it."""
+        """The row of the point in `table`."""
         require_single(self, self.value, 0)
         place = self.place if int(self.status) == Status.OK else NOWHERE
         *extent, period = np.where(place == 0, [0, 0, 0, 0, np.nan], place)  # none at equilibria
@@ -436,14 +451,26 @@ class BifurcationPoint(eqx.Module):
         }
 
     def table(self) -> "pandas.DataFrame":
-        """One row: kind, belts, type, value, error, residual, iterations, x1_min, x1_max, x2_min,
-        x2_max and period of the motion there, multiplier, coefficient, status. Points of a scan:
-        `pandas.concat`."""
+        """Returns one row.
+
+        Columns: kind, belts, type, value, error, residual, iterations, x1_min, x1_max, x2_min,
+        x2_max and period of the motion there, multiplier, coefficient, status. For the points of a
+        scan use `pandas.concat`.
+        """
         return table_of([self.row()])
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw the phase plane at the point, with the cycle where there is one, into the axes `ax`
-        (None: new ones), which are returned. `ValueError` where no point was found."""
+        """Draws the phase plane at the point, with the cycle where there is one.
+
+        Args:
+            ax: Axes; None makes new ones.
+
+        Returns:
+            The axes.
+
+        Raises:
+            ValueError: If no point was found.
+        """
         return draw(self, ax)
 
     def __repr__(self) -> str:
@@ -451,9 +478,12 @@ class BifurcationPoint(eqx.Module):
             return f"BifurcationPoint({self.condition!r}, value={self.value.shape})"
         if int(self.status) != Status.OK:
             name, advice = Status(int(self.status)).name, describe(self.status)
-            if "jb.scan" not in advice:
+            if self.sides:
+                below, above = self.sides
+                advice = f"{advice} Below, {below!r}; above, {above!r}."
+            elif "jb.scan" not in advice:
                 advice += " Every bifurcation point in an interval is found by jb.scan."
-            # Where the kind alone is not known, the place is, up to `error`.
+            # Where only the kind is unknown, the place is known up to `error`.
             value, error = f"value {number(self.value)}", float(self.error)
             value = f"{value}, error < {error:.1e}" if np.isfinite(error) else value
             return f"BifurcationPoint({self.condition!r}, {value}, {name}: {advice})"
@@ -466,18 +496,32 @@ class BifurcationPoint(eqx.Module):
 
 
 def given_point(point: BifurcationPoint, variation: Variation) -> BifurcationPoint:
-    """A point that was found in own units, in those of whoever gave what is varied."""
+    """A point that was found in own units, in the units of the given variation."""
     if variation.units is None:
         return point
     given, length, (unit,), _ = variation.units
     value = point.value * unit
     osc = given.oscillator(np.asarray(value)[None] if is_concrete(value) else value[None])
-    found = rescaled(point, length, lambda _: osc)
-    return replace(found, value=value, error=point.error * unit)
+    found = rescaled(replace(point, sides=()), length, lambda _: osc)
+    sides = tuple(_given_side(side, variation) for side in point.sides)
+    return replace(found, value=value, error=point.error * unit, sides=sides)
+
+
+def _given_side(side: Side, variation: Variation) -> Side:
+    given, length, (unit,), _ = variation.own
+    value = side.value * unit
+    osc = given.oscillator(np.asarray(value)[None])
+    return replace(rescaled(side, length, lambda _: osc), value=value)
 
 
 class Unexplained(AbstractCondition):
-    """What the oscillator does changes, and no other condition explains it; from `scan` only."""
+    """What the oscillator does changes, and no other condition explains it; from `scan` only.
+
+    The point's `sides` say what there is below its value and above, and how far the branches that
+    end there are from one another, see `Side`. Under a law that falls within a hundredth of the
+    belt's velocity the end of stick-slip is such a point: the fold in which a sticking cycle ends
+    is squeezed together with a canard.
+    """
 
     caption: ClassVar[str] = "unexplained"
 
@@ -487,14 +531,14 @@ class Unexplained(AbstractCondition):
     def prepared(self, osc, guess):
         raise NotImplementedError
 
-    def solved(self, family, system, x, p, status):
+    def point_near(self, family, system, x, p, status):
         raise NotImplementedError
 
-    def followed(self, point):
+    def system_at(self, point):
         raise ValueError(f"point must be of a kind that has curves, got {self!r}")
 
 
-#: A point is named by who asks for it: a name would be a constant of the compiled programs.
+#: Compiled programs return points without a name, as a name would be a constant in them.
 UNNAMED = Unexplained()
 
 
@@ -527,7 +571,7 @@ def _where_known(status: Array) -> Array:
 def point_without_cycle(
     family: Family, p, steps, size, error, status, why, x1: ArrayLike = jnp.nan
 ) -> BifurcationPoint:
-    """A point at p where there is no cycle: why not. x1: where the mass is at rest."""
+    """A point at p without a cycle; why: the reason; x1: displacement of the mass at rest."""
     iterations = jnp.sum(~jnp.isnan(steps))
     known = _where_known(status)
     at_point = family.at(p * known)

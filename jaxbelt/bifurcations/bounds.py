@@ -1,10 +1,11 @@
 """The curves that bound the regions of a plane of two parameters: `Bounds`.
 
-Points are found by `scan` along a few lines across the plane, and their curves are followed. What
-no line meets is missing then. So cells are asked: where two neighbours differ and no curve passes
-by, the points between these two are looked for, their curves followed, until no such pair is left,
-or only those between which nothing is found. Every end of a curve has a name at last: where it has
-none of its own, the point of codimension two in which it meets another curve.
+Points are found by `scan` along a few lines across the plane, and their curves are followed. Curves
+that no line meets are missing then. So cells are compared: where two neighbours differ and no curve
+passes between them, the points between these two are searched and their curves followed, until
+there is no such pair left, or only pairs between which nothing is found. At last every end of a
+curve gets a name: if it has none of its own, that of the point of codimension two in which it meets
+another curve.
 """
 
 from collections.abc import Sequence
@@ -25,24 +26,25 @@ from .path import ParameterPath
 from .scan import search
 from .special import SpecialPoint
 
-#: A curve bounds two neighbouring cells if it passes the way between them so near, in cells: chords
-#: of a bent curve are off by less.
+#: A curve bounds two neighbouring cells if it passes the line between them this near, in cells:
+#: chords of a bent curve are off by less.
 PASSES_BY = 0.1
-#: A pair between which nothing is found stands for others of the same two motions so near, in
+#: A pair between which nothing is found stands for others of the same two motions this near, in
 #: cells.
 ALIKE = 3.0
-#: Points on the way between two cells, and on a curve, so many a cell, whose distances are taken.
+#: Number of points for each cell, on the line between two cells and on a curve, whose distances are
+#: computed.
 PER_CELL = 8
-#: Values looked at first between two cells.
+#: Number of values at which the search between two cells begins.
 BETWEEN = 6
 
-#: So many rows of a curve in succession on another one tell that they are one from there.
+#: Number of successive rows of a curve on another one from which both count as one curve.
 DOUBLED = 4
 #: Places of one cycle in rows of two curves that are a step apart differ by less, relative to its
 #: size.
 SAME_PLACE = 0.05
-#: A curve ends in a point that is known, if it is no farther than so many steps, and its own last
-#: rows lead by there, at this part of the distance; rows that tell.
+#: A curve ends in a known point that is no farther than MEETS steps if its last END_ROWS rows lead
+#: past it at no more than this part (MISSES) of the distance.
 MEETS, MISSES, END_ROWS = 4.0, 0.2, 4
 
 #: Two neighbouring cells, the parameters of each.
@@ -53,49 +55,49 @@ class Bounds:
     """The curves in a plane, found so far.
 
     variation: of both parameters; values: of each, increasing; step: between the points of curves,
-    with both sides as long as 1.4.
+    in units in which both sides have the length 1.4.
     """
 
     def __init__(self, variation: Variation, values: Sequence[np.ndarray], step: float):
         self.variation, self.values = variation, values
         self.limits = np.array([(float(along[0]), float(along[-1])) for along in values])
         self.step = step
-        #: What is 1 where distances are taken, of each parameter.
+        #: Unit of each parameter for distances.
         self.unit = np.ptp(self.limits, axis=1) / 1.4
         #: The mean size of a cell.
         self.cell = np.ptp(self.limits, axis=1) / [len(along) - 1 for along in values]
         self.curves: list[BifurcationCurve] = []
 
     def search_lines(self, lines: int) -> None:
-        """Follow the curve of every point on so many lines parallel to each axis."""
+        """Follows the curves of all points on so many lines parallel to each axis."""
         across = [
             (along, float(fixed))
             for along in (0, 1)
             for a, b in [self.limits[1 - along]]
             for fixed in a + (b - a) * (np.arange(lines) + 0.37) / lines
         ]
-        # The next lines are searched while curves are followed from those before.
+        # The next lines are searched while curves are followed from the lines before.
         with ThreadPoolExecutor(1) as ahead:
             searches = [
                 (line, ahead.submit(as_here(self._points), *line, self.limits[line[0]]))
                 for line in across
             ]
             for count, ((along, fixed), found) in enumerate(searches, 1):
-                told = f"{count} of {len(across)} lines"
-                self._follow(found.result(), along, fixed, told)
+                source = f"{count} of {len(across)} lines"
+                self._follow(found.result(), along, fixed, source)
 
     def search_between(self, motions: np.ndarray, left_out: np.ndarray) -> tuple[Pair, ...]:
-        """Follow the curves between neighbouring cells that differ; returns the pairs without any.
+        """Follows the curves between neighbouring cells that differ; returns the pairs without any.
 
-        motions: a number for what there is in each cell, [n, m], negative where that is not known;
-        left_out: cells that are not asked, [n, m].
+        motions: a number for the motions in each cell, [n, m], negative where these are not known;
+        left_out: cells that are not compared, [n, m].
         """
         rows = neighbours_that_differ(motions, left_out)
         rows = rows[self.away(rows) > PASSES_BY]
         untried = np.ones(len(rows), bool)
         while np.any(untried):
             away = np.where(untried, self.away(rows), -1.0)
-            # Far from curves that are known, and so from points of codimension two on them.
+            # The pair farthest from known curves, and so from points of codimension two on them.
             at = int(np.argmax(away))
             row, column, along = rows[at].tolist()
             note_progress(
@@ -115,7 +117,7 @@ class Bounds:
         return tuple(self.pair(row) for row in rows.tolist())
 
     def name_ends(self) -> None:
-        """Give ends without a name that of the point in which they meet another curve."""
+        """Names ends without a name after the point in which they meet another curve."""
         for number, curve in enumerate(self.curves):
             others = [other for other in self.curves if other is not curve]
             known = [point for other in others for point in other.special]
@@ -126,18 +128,19 @@ class Bounds:
             self.curves[number] = curve
 
     def _points(self, along: int, fixed: float, ends, resolution: int = 0):
-        """The points on a line parallel to an axis, the other parameter being fixed."""
+        """Points on a line parallel to an axis, the other parameter being fixed."""
         span = float(ends[0]), float(ends[1])
         path = ParameterPath(self.variation.held(1 - along, fixed), None, span, basins=False)
-        # From farther off, too, where the line is short.
+        # A short line is searched farther off, too.
         return search(path, resolution, near=1.0) if resolution else search(path)
 
     def _follow(
-        self, points: Sequence[BifurcationPoint], along: int, fixed: float, told: str
+        self, points: Sequence[BifurcationPoint], along: int, fixed: float, source: str
     ) -> None:
-        """Follow the curves of points that are on none that is known."""
+        """Follows the curves of points that are on no known curve; source: words for their
+        origin."""
         for point in points:
-            note_progress(f"{len(self.curves)} curves from {told}")
+            note_progress(f"{len(self.curves)} curves from {source}")
             pair = np.empty(2)
             pair[along], pair[1 - along] = float(point.value), fixed
             if point.status == Status.OK and not any(
@@ -149,7 +152,7 @@ class Bounds:
                 self.curves.append(_without_known(curve, pair, self.curves, self.step, self.unit))
 
     def away(self, rows: np.ndarray) -> np.ndarray:
-        """How far from the way between the two cells the next curve passes, in cells, [pairs]."""
+        """Distance of the nearest curve from the line between the two cells, in cells, [pairs]."""
         from scipy.spatial import KDTree  # late, as only maps need it
 
         if not self.curves or not len(rows):
@@ -171,10 +174,10 @@ class Bounds:
 
 def neighbours_that_differ(motions: np.ndarray, left_out: np.ndarray) -> np.ndarray:
     """Neighbouring cells that differ: row and column of the first one, and the axis, [pairs, 3]."""
-    told = (motions >= 0) & ~left_out
+    known = (motions >= 0) & ~left_out
     found = []
     for along in (0, 1):
-        a, b = (np.moveaxis(array, along, 0) for array in (motions, told))
+        a, b = (np.moveaxis(array, along, 0) for array in (motions, known))
         differ = (a[1:] != a[:-1]) & b[1:] & b[:-1]
         first, other = np.nonzero(differ)
         places = (first, other) if along == 0 else (other, first)
@@ -183,7 +186,7 @@ def neighbours_that_differ(motions: np.ndarray, left_out: np.ndarray) -> np.ndar
 
 
 def _alike(rows: np.ndarray, at: int, motions: np.ndarray) -> np.ndarray:
-    """Which pairs are of the same two motions as that one, and near to it."""
+    """Which pairs have the same two motions as this one, and are near to it."""
     first = motions[rows[:, 0], rows[:, 1]]
     second = motions[rows[:, 0] + (rows[:, 2] == 0), rows[:, 1] + (rows[:, 2] == 1)]
     low, high = np.minimum(first, second), np.maximum(first, second)
@@ -198,8 +201,10 @@ def _without_known(
     step: float,
     unit: np.ndarray,
 ) -> BifurcationCurve:
-    """The part of a curve, around where it began, that is on no other one: where curves of one kind
-    meet in a point of codimension two, they may go on as one."""
+    """The part of a curve, around its beginning, that is on no other curve.
+
+    Curves of one kind that meet in a point of codimension two may go on as one.
+    """
     doubled = np.zeros(len(curve), bool)
     for other in known:
         if other.condition.lineage == curve.condition.lineage and len(other) > 1:
@@ -221,7 +226,7 @@ def _without_known(
 def _rows_on(
     curve: BifurcationCurve, other: BifurcationCurve, near: float, unit: np.ndarray
 ) -> np.ndarray:
-    """Which rows of a curve are on another one, in the same place, [rows]."""
+    """Which rows of a curve are on another one, with the motion at the same place, [rows]."""
     path, rows, found = other.path / unit, other.values / unit, np.zeros(len(curve), bool)
     for row, (at, place) in enumerate(zip(curve.values / unit, curve.places, strict=True)):
         away, _ = _from_chords(at, path)
@@ -231,7 +236,8 @@ def _rows_on(
 
 
 def _from_chords(at: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far a point is from each chord of a path, and at which part of it that is, [chords]."""
+    """Distance of a point from each chord of a path, and the part of the chord where it is,
+    [chords]."""
     a, chord = path[:-1], np.diff(path, axis=0)
     along = np.sum((at - a) * chord, axis=1) / np.maximum(np.sum(chord**2, axis=1), 1e-300)
     along = np.clip(along, 0, 1)
@@ -239,13 +245,13 @@ def _from_chords(at: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _shortened(curve: BifurcationCurve, first: int, last: int) -> BifurcationCurve:
-    """A curve from one of its rows to another."""
+    """The part of a curve from one of its rows to another."""
     if (first, last) == (0, len(curve) - 1):
         return curve
     special, row = [], -1
     for item in curve.in_order():
         if isinstance(item, SpecialPoint):
-            # Those between the last row left out and the first one kept are its ends.
+            # Special points between the last row left out and the first one kept are its ends.
             if first - 1 <= row <= last:
                 special.append(item)
         else:
@@ -274,10 +280,10 @@ def _meeting_at_end(
     step: float,
     unit: np.ndarray,
 ) -> SpecialPoint | None:
-    """The point, of those known, in which a curve ends at its first row, 0, or its last one, -1, if
-    it stops there for no reason that is known.
+    """The known point in which a curve ends, if its end has no other reason.
 
-    It is near, and the curve goes there: as far as a parabola through its last rows tells.
+    end: 0 for its first row, -1 for its last one. The point has to be near, and a parabola through
+    the last rows has to lead there.
     """
     if curve.ends[end] in (Stop.LEFT_SPAN, Stop.CLOSED) or curve.is_named(end):
         return None
@@ -285,7 +291,7 @@ def _meeting_at_end(
     rows = values[:END_ROWS] if end == 0 else values[::-1][:END_ROWS]
     gone = np.append(0.0, np.cumsum(np.hypot(*np.diff(rows, axis=0).T)))
     degree = min(2, len(rows) - 1)
-    # Where it was cut it may have gone a little beyond.
+    # Where the curve was cut it may have gone a little beyond.
     ahead = np.linspace(step, -MEETS * step, 200)
     fits = [np.polyfit(gone, column, degree) for column in rows.T]
     path = np.column_stack([np.polyval(fit, ahead) for fit in fits])
@@ -306,7 +312,7 @@ def _lies_on(
     step: float,
     unit: np.ndarray,
 ) -> bool:
-    """Whether a point is on a curve that is known."""
+    """Whether a point is on a known curve."""
     if point.condition.lineage != curve.condition.lineage:
         return False
     away, along = _from_chords(at / unit, curve.values / unit)

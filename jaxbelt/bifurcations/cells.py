@@ -1,9 +1,9 @@
-"""What there is in the cells of a map: `look_at`; and how regions are named.
+"""The motions in the cells of a map: `motions_in_cells`; and the names of regions.
 
 A cell is a point of a plane of two parameters. Its equilibria are known in closed form. Its cycles
-are those that runs lead to, from the starts from which `scan` follows orbits: where stick phases
-end, for a cycle that sticks comes by there, and at several distances from an equilibrium. So a cell
-knows what a path through it does.
+are those that runs lead to, from the starts from which `scan` follows orbits: ends of stick phases,
+which every cycle that sticks passes, and several distances from an equilibrium. So a cell finds
+what a path through it finds.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -24,16 +24,16 @@ from ..sweeps.attractor import CYCLE, UNDECIDED, Attractor, signature
 from ..sweeps.fractions import PLACE
 from ..sweeps.grid import Grid
 from ..sweeps.question import LONG_ENOUGH
-from ..sweeps.shares import told_apart
+from ..sweeps.shares import numbers_of_attractors
 from ..sweeps.work import results_of
 from .guesses import starts as starts_of_scan
 from .labels import Label
 
-#: Velocities that differ by less are one, but for rounding.
+#: Velocities that differ by less are equal up to rounding.
 SAME_VELOCITY = 1e-12
-#: Tolerances of the runs.
+#: Tolerance of the runs.
 RUN_TOLERANCE = 1e-8
-#: What names say of an equilibrium.
+#: Letters for equilibria in names.
 LETTERS = {
     EquilibriumKind.FIXED_POINT: "f",
     EquilibriumKind.PSEUDO_FOCUS: "p",
@@ -45,16 +45,17 @@ LETTERS = {
 
 
 def region_name(osc: Oscillator, label: Label) -> str:
-    """The name of what a label tells, in the manner of the paper's Fig. 6.
+    """Name of a region with this label, in the manner of the paper's Fig. 6.
 
     A digit: 1 there is a stable equilibrium only; 2 a stable cycle, too; 3 a stable cycle only.
-    Where belts run in opposite directions these are 6, 5 and 4. With several belts a letter tells
-    what the cycle sticks to: a belt 0, b belt 1, c both (belts as binary digits, for more of them),
-    s none. Of several cycles each has its letter.
+    Where belts run in opposite directions these are 6, 5 and 4. With several belts a letter for
+    each cycle shows what it sticks to: a belt 0, b belt 1, c both (belts as binary digits, for more
+    of them), s none.
 
     With contact edges there may be several equilibria, of several kinds. There the digit is 1, 2 or
-    3 wherever belts run to, and after a colon the equilibria follow from left to right: f a fixed
-    point, p a pseudo-focus, h a segment that holds; in brackets those that do not attract.
+    3 in whatever directions belts run, and after a colon the equilibria follow from left to right:
+    f a fixed point, p a pseudo-focus, h a segment that holds; in brackets those that do not
+    attract.
     """
     velocities = [float(belt.velocity) for belt in osc.belts]
     opposite = min(velocities) < 0 < max(velocities)
@@ -74,9 +75,12 @@ def _name(
     equilibria: Sequence[tuple[int, bool]],
     cycles: Sequence[Collection[int]],
 ) -> str:
-    """As `region_name`, by what is known: whether there are contact edges, whether belts run in
-    opposite directions, how many there are; (kind, stable) of the equilibria from left to right;
-    the belts to which each cycle sticks. "" where nothing attracts."""
+    """Like `region_name`, from data; "" where nothing attracts.
+
+    edged: whether there are contact edges; opposite: whether belts run in opposite directions;
+    belts: their number; equilibria: (kind, stable), from left to right; cycles: the belts to which
+    each one sticks.
+    """
     rests = any(stable for _, stable in equilibria)
     if not rests and not cycles:
         return ""
@@ -94,8 +98,10 @@ def _name(
 
 
 def in_plane_of_paper(oscillators: Sequence[Oscillator]) -> bool:
-    """Whether oscillators are those of the plane of the paper's Fig. 6, where regions have their
-    names: class (b) with its friction, loads and damping, and any velocities of the belts."""
+    """Whether oscillators lie in the plane of the paper's Fig. 6, where regions have its names.
+
+    That is class (b) with the paper's friction, loads and damping, and any velocities of the belts.
+    """
 
     def is_there(osc: Oscillator) -> bool:
         paper = class_b(*([belt.velocity for belt in osc.belts] * 2)[:2])
@@ -110,12 +116,12 @@ def in_plane_of_paper(oscillators: Sequence[Oscillator]) -> bool:
 
 
 class Cells(NamedTuple):
-    """What there is in each cell, arrays [cells].
+    """The motions in each cell, arrays [cells].
 
     names: of the regions, "" where runs were undecided, or nothing attracts. motions: a number for
-    all that there is: kind, stability and contacts of each equilibrium, the events of each cycle
-    and the belts that it sticks to; equal where that is equal, -1 where runs were undecided.
-    on_line: whether a belt is at rest there, or two run at one velocity.
+    everything: kind, stability and contacts of each equilibrium, the events of each cycle and the
+    belts that it sticks to; equal where all that is equal, -1 where runs were undecided. on_line:
+    whether a belt is at rest there, or two belts have one velocity.
     """
 
     names: np.ndarray
@@ -123,15 +129,15 @@ class Cells(NamedTuple):
     on_line: np.ndarray
 
 
-def look_at(
+def motions_in_cells(
     make: Callable[..., Oscillator],
     names: Sequence[str],
     points: np.ndarray,
     starts: Sequence[tuple[float, float]] = (),
 ) -> Cells:
-    """What there is at points of a plane, [cells, 2], the values of two arguments of `make`.
+    """The motions at points of a plane, [cells, 2], the values of two arguments of `make`.
 
-    starts: further ones, (x1, x2), from which each cell is run.
+    starts: further starts, (x1, x2), of the runs in each cell.
     """
     points = np.asarray(points, float)
     still: Any = jax.tree.map(np.asarray, _still_at(make, tuple(names), jnp.asarray(points)))
@@ -160,8 +166,8 @@ def _arguments(names: Sequence[str], point: Any) -> dict[str, float]:
 
 
 def _on_line(velocities: np.ndarray) -> np.ndarray:
-    """Where a belt is at rest, or two run at one velocity; velocities: [cells, belts]."""
-    # A belt is at rest where it runs at the velocity of one that does not.
+    """Where a belt is at rest, or two have one velocity; velocities: [cells, belts]."""
+    # A belt at rest has the velocity of the frame, which counts as one more belt.
     count, n = velocities.shape
     others = np.append(velocities, np.zeros((count, 1)), axis=-1)
     meet = np.abs(velocities[:, :, None] - others[:, None, :]) < SAME_VELOCITY
@@ -169,9 +175,11 @@ def _on_line(velocities: np.ndarray) -> np.ndarray:
 
 
 class _Still(NamedTuple):
-    """What is known of the cells before anything is run: of the equilibria kind, stable, [cells,
-    equilibria], and modes, [.., belts]; velocities, [cells, belts]; the starts of `scan`, [cells,
-    starts, 2]; the leaves of the oscillators, [cells] each."""
+    """What is known of the cells before any run.
+
+    kind, stable: of the equilibria, [cells, equilibria]; modes: [.., belts]; velocities: [cells,
+    belts]; starts: of `scan`, [cells, starts, 2]; leaves: of the oscillators, [cells] each.
+    """
 
     kind: Array
     stable: Array
@@ -188,7 +196,7 @@ def _still_at(make, names, points: Array) -> _Still:
         rests = candidates(osc)
         velocities = jnp.stack([belt.velocity for belt in osc.belts])
         starts = starts_of_scan(osc, rests)
-        # Contacts of a belt without load, which does nothing, are no difference.
+        # Contacts of a belt without load, which does nothing, make no difference.
         idle = jnp.stack([belt.load for belt in osc.belts]) == 0
         modes = jnp.where(idle, 0, rests.modes)
         leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves(osc)]
@@ -198,20 +206,23 @@ def _still_at(make, names, points: Array) -> _Still:
 
 
 def _cycles_at(make, names, points, still: _Still, more: np.ndarray):
-    """Which cells are decided, [cells], the numbers of the sorts of cycles that each has, in order,
-    -1 where it has no more, [cells, cycles]; and the belts to which each sort sticks."""
+    """Which cells are decided, [cells], and the cycles in them.
+
+    The latter are the numbers of the sorts of cycles, in order, -1 where there are no more, [cells,
+    cycles], and the belts to which each sort sticks.
+    """
     belts = still.velocities.shape[1]
-    told, ran = _runs_from(make, names, points, still, more)
-    kinds = told["kind"].astype(int)
-    escapes = told["status"] == Status.NOT_FINITE
+    results, ran = _runs_from(make, names, points, still, more)
+    kinds = results["kind"].astype(int)
+    escapes = results["status"] == Status.NOT_FINITE
     decided = ~np.any(ran & (kinds == UNDECIDED) & ~escapes, axis=1)
-    sticks = told["sticks"].astype(int)
-    known, which = np.unique(told["signature"], return_inverse=True)
+    sticks = results["sticks"].astype(int)
+    known, which = np.unique(results["signature"], return_inverse=True)
     signatures = np.array([signature(int(word) if word < 2**53 else -1, belts) for word in known])
-    places = np.stack([told[name] for name in PLACE], axis=-1)
+    places = np.stack([results[name] for name in PLACE], axis=-1)
     runs = Runs(places, signatures[which.reshape(kinds.shape)], RUN * RUN_TOLERANCE)
     cycles = np.where(kinds == CYCLE, kinds, UNDECIDED)
-    labels = told_apart(
+    labels = numbers_of_attractors(
         cycles, sticks, runs, lambda point: make(**_arguments(names, points[point]))
     )
     codes = sticks @ 2 ** np.arange(belts)
@@ -228,8 +239,7 @@ def _cycles_at(make, names, points, still: _Still, more: np.ndarray):
 
 
 def _runs_from(make, names, points, still: _Still, more: np.ndarray):
-    """What the observer of attractors tells of the runs, by name, [cells, starts, ..], and which
-    there are."""
+    """Results of the observer of attractors, by name, [cells, starts, ..], and which runs exist."""
     grid = Grid(make, {name: points[:1, i] for i, name in enumerate(names)}, (0.0, 0.0))
     begun = np.broadcast_to(more, (len(points), *more.shape))
     begun = np.concatenate([still.starts, begun], axis=1)
@@ -244,9 +254,9 @@ def _runs_from(make, names, points, still: _Still, more: np.ndarray):
         return np.concatenate([states, [leaf[at] for leaf in varying]])[None]
 
     numbers = {"t1": LONG_ENOUGH, "rtol": RUN_TOLERANCE, "atol": RUN_TOLERANCE}
-    told = {}
+    results = {}
     columns = results_of(grid.program(Attractor()), grid.shared, rows_of, len(cell), **numbers)
     for name, column in columns.items():
-        told[name] = np.zeros((*ran.shape, *column.shape[1:]))
-        told[name][ran] = np.nan_to_num(column)
-    return told, ran
+        results[name] = np.zeros((*ran.shape, *column.shape[1:]))
+        results[name][ran] = np.nan_to_num(column)
+    return results, ran

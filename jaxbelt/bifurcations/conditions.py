@@ -1,9 +1,9 @@
-"""Conditions on a cycle, and what a condition of one's own is written with.
+"""Conditions on a cycle, and the base classes for a user's own condition.
 
-`AbstractCycleCondition` shares what conditions on a cycle have in common, as
-`rests.AbstractRestCondition` does for a state of rest; `AbstractStickCondition` knows that two
-belts may do all that they do together. A functional of an attracting cycle that has a given value
-is a `CycleEquation`, for which a class with one method will do.
+`AbstractCycleCondition` has what conditions on a cycle have in common, as
+`rests.AbstractRestCondition` has for a state of rest; `AbstractStickCondition` allows for two belts
+that act together all along. A functional of an attracting cycle that has a given value is a
+`CycleEquation`, for which a class with one method is enough.
 """
 
 import abc
@@ -25,13 +25,13 @@ from ..model.variations import Family
 from ..numerics.compiling import jit
 from ..results import Status
 from .base import AbstractCondition, point_of
-from .base import Line as Line  # a condition of one's own has one
+from .base import Line as Line  # a user's condition has one
 from .guesses import nearest
 from .systems import CycleSystem, Tests, solve_system
 
 
 class AbstractCycleCondition(AbstractCondition):
-    """A condition on a cycle. Its guess is a loop near that, and a status."""
+    """A condition on a cycle. Its guess is a loop near the cycle, and a status."""
 
     #: Arcs that `system` may add to a loop.
     more_arcs: ClassVar[int] = 0
@@ -49,7 +49,7 @@ class AbstractCycleCondition(AbstractCondition):
     def prepared(self, osc, guess):
         return _prepared(self, osc, *guess)
 
-    def solved(self, family, system, x, p, status):
+    def point_near(self, family, system, x, p, status):
         return _solved_point(family, system, x, p, status)
 
     def guess_near(self, beginning):
@@ -58,12 +58,12 @@ class AbstractCycleCondition(AbstractCondition):
     def beginnings(self, osc, cycles):
         return [one.loop for one in cycles]
 
-    def followed(self, point):
+    def system_at(self, point):
         chain, z = point.cycle.chain, point.cycle.unknowns
         loop = Loop(chain.codes, chain.ends, z[:, :2], z[:, 2])
         ok, data = jnp.asarray(Status.OK.value), self.sought.as_data()
         system, x, _ = _prepared(data, point.oscillator, loop, ok)
-        # With the steps of integration with which the point was found.
+        # With the integration steps with which the point was found.
         return eqx.tree_at(lambda system: system.chain.mesh, system, chain.mesh), x
 
 
@@ -86,8 +86,10 @@ def _solved_point(family: Family, system: CycleSystem, z0, p0, status):
 
 
 class AbstractStickCondition(AbstractCycleCondition):
-    """A condition on how a cycle begins, or ends, to stick to a belt; or to another one, where the
-    two run at one velocity and touch the mass at the same times."""
+    """A condition on how a cycle begins, or ends, to stick to a belt.
+
+    If two belts have one velocity and touch the mass at the same times, it may be either of them.
+    """
 
     belt: int | Array
 
@@ -104,24 +106,24 @@ class AbstractStickCondition(AbstractCycleCondition):
 
 @jit
 def _touch_alike(chain: Chain, pair: Array) -> Array:
-    """Whether both belts touch, or none, all along: what happens to one happens to the other."""
+    """Whether both belts touch, or none, all along, so that the same happens to both."""
     one, other = chain.codes[:, pair].T
     return jnp.all((one == other) | ~chain.used)
 
 
 class CycleEquation(AbstractCycleCondition):
-    """A functional of an attracting cycle has a given value: one equation more, in the unknowns of
-    the cycle as it is.
+    """A functional of an attracting cycle has a given value: one more equation for its unknowns.
 
-    The guess is the cycle that misses it least. `scan` looks for it where it is asked to, by the
-    sign of the equation in each attracting cycle.
+    The guess is the cycle with the smallest error. `scan` looks for the condition if asked to, by
+    the sign of the equation in each attracting cycle.
     """
 
     @abc.abstractmethod
     def equation(self, osc: Oscillator, chain: Chain, z: Array) -> Array:
-        """What vanishes, of the cycle with the unknowns z: (x1, x2, duration) of each arc, [N, 3].
+        """Returns the expression that vanishes.
 
-        The rows that `chain.used` does not name are padding, with a duration of zero.
+        z: unknowns of the cycle, (x1, x2, duration) of each arc, [N, 3]. Rows outside of
+        `chain.used` are padding, with a duration of zero.
         """
 
     def check(self, osc):
@@ -151,7 +153,7 @@ class CycleEquation(AbstractCycleCondition):
         return {}
 
     def distance(self, osc: Oscillator, loop: Loop) -> Array:
-        """How far a loop misses it."""
+        """Error of the equation for a loop."""
         return jnp.abs(self.equation(osc, *meshed(osc, loop)))
 
     def guess(self, osc, size):

@@ -1,23 +1,22 @@
-"""Orbits that lead from one saddle of a contact edge to another, or back to the same one:
-`SaddleConnection`.
+"""Orbits from one saddle of a contact edge to another, or back to the same one: `SaddleConnection`.
 
 At (sigma, 0) of an edge from which both sides push away two orbits begin and two end, in finite
-time: its unstable and its stable separatrices, see `cycles.separatrices`. Where one that begins at
-a saddle is one that ends at a saddle, the basins beside them change. Back to the same saddle it is
-a cycle of finite period that passes a point where orbits part: an unstable or an attracting one
-begins or ceases to be there.
+time: its unstable and its stable separatrices, see `cycles.separatrices`. Where an orbit that
+begins at a saddle ends at a saddle, the basins beside them change. An orbit back to the same saddle
+is a cycle of finite period that passes a point where orbits part: an unstable or an attracting
+cycle is born or vanishes there.
 
-The orbit from the saddle is a chain of arcs that is open. With the arcs of a cycle, see
-`cycles.shooting`, it has as many equations: that it begins at the saddle stands in place of that it
-closes, and that it ends at a saddle is the equation more. On one side of the point the orbit turns
-just before the edge, on the other one it passes it; the last arc is made to end where x2 = 0, so
-the equation, x1 = sigma there, is linear in the unknowns.
+The orbit from the saddle is an open chain of arcs. It has as many equations as a cycle with these
+arcs, see `cycles.shooting`: that it begins at the saddle replaces that it closes, and that it ends
+at a saddle is the additional equation. On one side of the point the orbit turns just before the
+edge, on the other side it passes the edge; the last arc is made to end where x2 = 0, so the
+equation, x1 = sigma there, is linear in the unknowns.
 
 Between two values the orbits from the saddles are compared by their courses: between which saddles
 each of their extrema of x1 lies, one after the other. These change where an extremum lies on a
-saddle, and nowhere else, for an orbit depends continuously on the parameter until it comes to one.
-It does not where the static limit of a belt exceeds mu(0), or a belt is at rest; courses are not
-compared there.
+saddle, and nowhere else, for an orbit depends continuously on the parameter until it comes to a
+saddle. It does not where the static limit of a belt exceeds mu(0), or a belt is at rest; courses
+are not compared there.
 
 Connections of two-folds are described by M. Guardia, T. Seara, M. Teixeira, Generic bifurcations of
 low codimension of planar Filippov systems, J. Differential Equations 250 (2011) 1967-2023, and
@@ -72,9 +71,11 @@ EXTREMA = 12
 
 
 class Connection(CycleSystem):
-    """An orbit from the saddle of one edge to that of another; leaves, arrives: their numbers, see
-    `modes.edges`. The chain has a row that is not used, the last one: its state is where the orbit
-    ends."""
+    """An orbit from the saddle of one edge to that of another.
+
+    leaves, arrives: numbers of the edges, see `modes.edges`. The last row of the chain is not used:
+    its state is the end of the orbit.
+    """
 
     chain: Chain
     leaves: Array
@@ -84,7 +85,7 @@ class Connection(CycleSystem):
         return z[-1, 0] - jnp.stack(edges(osc))[self.arrives]
 
     def _beginning(self, osc: Oscillator, entry: Array) -> Array:
-        """How far from its saddle it begins, [2]."""
+        """Difference of its first state from its saddle, [2]."""
         return entry - jnp.stack([jnp.stack(edges(osc))[self.leaves], jnp.zeros(())])
 
     def residual(self, osc, x):
@@ -92,7 +93,7 @@ class Connection(CycleSystem):
         return closed.at[self._closing(x)].set(self._beginning(osc, x[0, :2]))
 
     def _closing(self, x: Array) -> slice:
-        """The two of the equations of a closed chain that say that it closes."""
+        """The two equations of a closed chain that say that it closes."""
         return slice(x.size - 3, x.size - 1)
 
     def linearized(self, osc_of, x, p):
@@ -108,7 +109,7 @@ class Connection(CycleSystem):
         return value.at[rows].set(begins(u)), matrix.at[rows].set(row)
 
     def exists(self, osc: Oscillator, x: Array) -> Array:
-        """Whether the oscillator moves like that, from a saddle to a saddle."""
+        """Whether the oscillator moves along it, from a saddle to a saddle."""
         ends = jnp.stack([self.leaves, self.arrives])
         return admissible(osc, self.chain, x) & jnp.all(saddles(osc)[ends])
 
@@ -122,7 +123,7 @@ class Connection(CycleSystem):
         used = np.asarray(self.chain.used)
         return extent(np.concatenate([x[used], x[-1:]]))
 
-    def look(self, osc, x):
+    def seen_at(self, osc, x):
         error = jnp.max(jnp.abs(self.residual(osc, x)))
         exists = (error < HOLDS) & self.exists(osc, x)
         sticks = self.chain.used & jnp.any(self.chain.codes == 0, axis=-1)
@@ -139,9 +140,12 @@ class Connection(CycleSystem):
 class SaddleConnection(AbstractCondition):
     """A separatrix that leaves a saddle, (sigma, 0) of a contact edge, ends in a saddle.
 
-    belt: that of the edge which it leaves; to: that of the edge where it ends, the same or another
-    one (None: any). Where it is the same saddle, `cycle` of the point is the connection itself, a
-    cycle that begins or ceases to be there. Two belts may share the edge: either may be named.
+    Where it is the same saddle, `cycle` of the point is the connection itself, a cycle that is born
+    or vanishes there. Two belts may share the edge: either may be named.
+
+    Args:
+        belt: Number of the belt whose edge it leaves.
+        to: Number of the belt at whose edge it ends, the same or another one; None: any.
     """
 
     belt: int | Array
@@ -174,8 +178,8 @@ class SaddleConnection(AbstractCondition):
         return self.to is None or self.to in other._belts_reached(point)
 
     def _belts_reached(self, point) -> list[int]:
-        """The belts of which the edge is one where the connection at a point ends."""
-        system, _ = self.followed(point)
+        """Belts at whose edge the connection at a point ends."""
+        system, _ = self.system_at(point)
         positions = np.asarray(jnp.stack(edges(point.oscillator)))
         is_there = (positions == positions[int(system.arrives)]).reshape(2, -1)
         return np.flatnonzero(np.any(is_there, axis=0)).tolist()
@@ -205,10 +209,10 @@ class SaddleConnection(AbstractCondition):
     def prepared(self, osc, guess):
         return _with_mesh(osc, *guess)
 
-    def solved(self, family, system, x, p, status):
+    def point_near(self, family, system, x, p, status):
         return _solved_connection(family, system, x, p, status)
 
-    def followed(self, point):
+    def system_at(self, point):
         osc, data = point.oscillator, self.as_data()
         system, x, _ = data.prepared(osc, data.guess(osc, self.room))
         return system, _solved_at(osc, system, x)
@@ -217,16 +221,16 @@ class SaddleConnection(AbstractCondition):
         return "homoclinic" if int(point.cycle.status) == Status.OK else "heteroclinic"
 
     def place(self, point):
-        system, x = self.followed(point)
+        system, x = self.system_at(point)
         return system.place(np.asarray(x))
 
     def orbit(self, point):
-        system, x = self.followed(point)
+        system, x = self.system_at(point)
         states = np.asarray(_states_along(point.oscillator, system, x))
         return states[np.asarray(system.chain.used)].reshape(-1, 2)
 
     def limit(self, trail):
-        """Where it has shrunk with its saddle to a Hopf point on the edge."""
+        """The Hopf point on the edge to which it has shrunk together with its saddle."""
         if trail.end is Stop.POINT_COUNT:
             return None
         return hopf_limit("BoundaryHopf", trail, _from_edge, trail.system.leaves)
@@ -261,7 +265,7 @@ def _solved_connection(family: Family, system: Connection, z0, p0, status):
 
 @jit
 def _solved_at(osc: Oscillator, system: Connection, x: Array) -> Array:
-    """The unknowns of the orbit from its saddle, to the extremum that is to be one, too."""
+    """Unknowns of the orbit from its saddle, up to the point that will be an extremum."""
 
     def linearized(x):
         value, matrix = system.linearized(lambda _: osc, x.reshape(-1, 3), jnp.zeros(1))
@@ -294,7 +298,7 @@ def _departing(osc: Oscillator, edge: Array, rightward: Array, parts: Array, bud
 
 
 def _exits(orbit: Orbit) -> Array:
-    """The states at the ends of the arcs of an orbit, [arcs, 2]."""
+    """States at the ends of the arcs of an orbit, [arcs, 2]."""
     last = jnp.arange(orbit.ends.size) == orbit.count - 1
     return jnp.where(last[:, None], orbit.y, jnp.roll(orbit.entries, -1, axis=0))
 
@@ -308,8 +312,11 @@ def _turns_back(osc: Oscillator, orbit: Orbit) -> Array:
 
 @jit
 def _nearest_connection(osc: Oscillator, belt: Array, to: Array, size: int):
-    """Of the orbits from the saddles of a belt that which comes nearest to a saddle: as a loop, up
-    to there; the numbers of both edges; a status. to: the belt of that saddle; -1: any."""
+    """The orbit from the saddles of a belt that comes nearest to a saddle.
+
+    Returns it as a loop, up to there, the numbers of both edges, and a status. to: the belt of the
+    saddle at its end; -1: any.
+    """
     osc = lax.stop_gradient(osc)
     n, names, parts = len(osc.belts), Ends(len(osc.belts)), saddles(osc)
     positions = jnp.stack(edges(osc))
@@ -324,7 +331,7 @@ def _nearest_connection(osc: Oscillator, belt: Array, to: Array, size: int):
         exits = _exits(orbit)
         turns = jnp.where(_turns_back(osc, orbit), 0.0, jnp.inf)
         turned = jnp.abs(exits[:, :1] - positions[None]) + turns[:, None]
-        # How much further one that passes a saddle would have gone in its mode.
+        # Distance that an orbit which passes a saddle would have gone farther in its mode.
         on_edge = (orbit.ends >= n) & (orbit.ends < 3 * n)
         at = positions[jnp.clip(orbit.ends - n, 0, 2 * n - 1)]
         push = jax.vmap(
@@ -358,14 +365,17 @@ def _nearest_connection(osc: Oscillator, belt: Array, to: Array, size: int):
 
 # --- courses --------------------------------------------------------------------------------------
 
-#: Between which saddles the first extrema of x1 lie, `EXTREMA` of them.
+#: For each of the first `EXTREMA` extrema of x1, between which saddles it lies.
 SaddleCourse = tuple[int, ...]
 
 
 class _Courses(eqx.Module):
-    """Of each edge and each side, [edges, sides]: whether an orbit leaves a saddle there, x1 at the
-    ends of its arcs that are extrema of it, else NaN, [edges, sides, arcs], the row after which it
-    repeats, or -1, and x1 where it was left, at rest, else NaN."""
+    """Courses for each edge and each side, [edges, sides].
+
+    leaves: whether an orbit leaves a saddle there; extrema: x1 at the ends of arcs that are extrema
+    of it, else NaN, [edges, sides, arcs]; repeats: the row after which it repeats, or -1; rest: x1
+    where the orbit ended at rest, else NaN.
+    """
 
     positions: Array
     leaves: Array
@@ -403,8 +413,10 @@ def _courses_of(oscs: Oscillator) -> _Courses:
 
 
 def courses_of(oscs: Oscillator) -> list[tuple[SaddleCourse, ...]]:
-    """Of each of many oscillators the courses of the orbits that leave saddles, from left to right,
-    that to the left first."""
+    """Courses of the orbits that leave saddles, for each oscillator of a batch.
+
+    From left to right, that to the left first.
+    """
     if not np.any(_all_saddles(oscs)):
         return [()] * len(oscs.damping)
     seen = jax.tree.map(np.asarray, _courses_of(oscs))
@@ -433,7 +445,7 @@ def _course(at: Any, extrema: Any, repeats: Any, rest: Any) -> SaddleCourse:
     elif repeats >= 0:
         again = letters[-max(int(np.sum(known[int(repeats) + 1 :])), 1) :]
     else:
-        again = letters[-2:]  # not yet settled: where it last turned, to both sides
+        again = letters[-2:]  # not yet converged: its last extrema, on both sides
     while again and len(letters) < EXTREMA:
         letters += again
     return tuple(letters[:EXTREMA])

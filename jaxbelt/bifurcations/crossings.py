@@ -1,11 +1,12 @@
 """Cycles that cross a boundary beside where they would stick, and belts that change places.
 
-- `CrossingSliding`: the cycle arrives at a boundary r_k = 0 just at an end of the stretch of it on
-  which the mass sticks. To one side of it the mass sticks, to the other the boundary is crossed:
-  a crossing-sliding bifurcation (M. di Bernardo, C. Budd, A. Champneys, P. Kowalczyk,
-  Piecewise-smooth Dynamical Systems, 2008). Linear in the unknowns, x1 = rest +- capacity.
+- `CrossingSliding`: the cycle arrives at a boundary r_k = 0 exactly at an end of the stretch of it
+  on which the mass sticks. On one side of that end the mass sticks, on the other the boundary is
+  crossed: a crossing-sliding bifurcation (M. di Bernardo, C. Budd, A. Champneys, P. Kowalczyk,
+  Piecewise-smooth Dynamical Systems, 2008). The equation is linear in the unknowns, x1 = rest +-
+  capacity.
 - `SlidingExchange`: nu_i = nu_j, and a cycle that sticks to i or j. The friction of each mode keeps
-  its sign, so the cycle with its signature fixed goes smoothly through the point. Its name is the
+  its sign, so the cycle with its signature fixed goes smoothly through the point. The name is the
   paper's.
 """
 
@@ -44,9 +45,9 @@ from .tangencies import Encounter
 
 
 class StickLimit(CycleSystem):
-    """A cycle of which the arc `row` arrives at a boundary at an end of where the mass sticks.
+    """A cycle whose arc `row` arrives at a boundary at an end of the stretch where the mass sticks.
 
-    codes: of the mode in which it sticks there; side: 1 the end on the right, -1 on the left.
+    codes: of the mode in which it sticks there; side: 1 for the end on the right, -1 on the left.
     """
 
     chain: Chain
@@ -63,10 +64,10 @@ class StickLimit(CycleSystem):
 
 
 def arrival_tests(osc: Oscillator, chain: Chain, z: Array, row: Array, own: bool | Array = False):
-    """What to watch of a cycle of which something happens at the end of the arc `row`.
+    """Functions to watch for a cycle with a coincidence at the end of the arc `row`.
 
-    A stick phase that begins or ends there may have no duration. own: at the ends of which other
-    arcs the boundaries of which belts are part of what happens, [arcs, belts].
+    A stick phase that begins or ends there may have no duration. own: boundaries that are part of
+    the coincidence, by the arcs at whose ends they lie, [arcs, belts].
     """
     others = chain.used & ~stick_phase_from(osc, chain, (row + 1) % jnp.sum(chain.used))
     here = jnp.arange(others.size) == row
@@ -76,13 +77,16 @@ def arrival_tests(osc: Oscillator, chain: Chain, z: Array, row: Array, own: bool
 
 
 class CrossingSliding(AbstractStickCondition):
-    """The cycle crosses the boundary of a belt, and begins to stick to it where it did.
+    """The cycle crosses the boundary of a belt and begins to stick to it at the crossing.
 
-    It arrives at one end of where the mass sticks: that of slip onset, at which a stick phase
-    begins with no duration (crossing), or the other one, from which it then sticks all the way, and
-    before which it crosses the boundary, comes back soon and sticks then (buckling). Where the
-    static limit exceeds mu(0), it goes far beyond the boundary at once, and may not come back
-    (jump).
+    It arrives at one end of the stretch where the mass sticks. At the end of slip onset a stick
+    phase begins with no duration (crossing). From the other end the mass sticks all the way;
+    before, the cycle crosses the boundary, comes back soon and sticks then (buckling). Where the
+    static limit exceeds mu(0), the orbit goes far beyond the boundary at once, and may not come
+    back (jump).
+
+    Args:
+        belt: Number of the belt.
     """
 
     caption: ClassVar[str] = "crossing-sliding, belt {belt}"
@@ -93,13 +97,13 @@ class CrossingSliding(AbstractStickCondition):
 
     @property
     def room(self):
-        return SIZES[1]  # passing edges takes more of them
+        return SIZES[1]  # passing edges needs more arcs
 
     def guess(self, osc, size):
         return nearest(osc, size, self)
 
     def distance(self, osc: Oscillator, loop: Loop) -> Array:
-        """How far a loop arrives from such an end."""
+        """Distance of a loop's arrival from such an end."""
         return arrival_near_limit(osc, loop, self.belt).distance
 
     def system(self, osc, loop, status):
@@ -107,7 +111,7 @@ class CrossingSliding(AbstractStickCondition):
         exists = (status != Status.OK) | jnp.isfinite(near.distance)
         status = jnp.where(exists, status, Status.NOT_TOUCHED.value)
         # Having crossed, the orbit may come back to the boundary soon and stick. The equations of
-        # that excursion are of second order, and it is left out.
+        # that excursion are of second order, so it is left out.
         count = jnp.maximum(jnp.sum(loop.used), 1)
         after = (near.row + 1 + jnp.arange(3)) % count
         returns = (loop.ends[after[0]] == Ends(len(osc.belts)).extremum_x2) & (count > 3)
@@ -120,7 +124,7 @@ class CrossingSliding(AbstractStickCondition):
 
     def type_of(self, point):
         side, jumps = _limit_met(point.cycle, self.belt)
-        # The mass leaves where it sticks in the direction in which the belt moves.
+        # The mass leaves the stretch where it sticks in the direction in which the belt moves.
         if side * velocity_of(point.oscillator, self.belt) > 0:
             return "crossing"
         return "jump" if jumps else "buckling"
@@ -135,8 +139,11 @@ TimedCrossing.public = CrossingSliding
 
 
 class Arrival(eqx.Module):
-    """An arc that arrives at a boundary: how far from an end of where the mass sticks, its row, and
-    the rest of a `StickLimit`."""
+    """An arc that arrives at a boundary.
+
+    distance: from an end of the stretch where the mass sticks; row: of the arc; codes, side: as in
+    `StickLimit`.
+    """
 
     distance: Array
     row: Array
@@ -145,7 +152,7 @@ class Arrival(eqx.Module):
 
 
 def arrival_near_limit(osc: Oscillator, loop: Loop, belt: int | Array) -> Arrival:
-    """Of the arcs of a loop that arrive at the boundary of a belt that nearest to such an end.
+    """The arc of a loop that arrives at the boundary of a belt nearest to such an end.
 
     At the other end the orbit would arrive tangentially, with the other sign of r.
     """
@@ -167,8 +174,8 @@ def arrival_near_limit(osc: Oscillator, loop: Loop, belt: int | Array) -> Arriva
 
 @jit
 def _limit_met(cycle: Cycle, belt: int | Array) -> tuple[Array, Array]:
-    """At which end of where the mass sticks a cycle arrives, see `StickLimit.side`, and whether a
-    law jumps there."""
+    """The end of the stretch at which a cycle arrives, see `StickLimit.side`, and whether a law
+    jumps there."""
     osc, chain, z = cycle.oscillator, cycle.chain, cycle.unknowns
     loop = Loop(chain.codes, chain.ends, z[:, :2], z[:, 2])
     near = arrival_near_limit(osc, loop, belt)
@@ -187,8 +194,10 @@ def has_jump(belt: Belt) -> Array:
 
 @jit
 def _loop_together(osc: Oscillator, belts: Array) -> tuple[Loop, Array]:
-    """The loop of the cycle that sticks to two belts at once if the second runs like the first, and
-    a status."""
+    """The loop of the cycle that sticks to two belts at once, with one velocity, and a status.
+
+    The second belt gets the velocity of the first.
+    """
     velocity = velocity_of(osc, belts[0])
     velocities = [
         jnp.where(belts[1] == i, velocity, one.velocity) for i, one in enumerate(osc.belts)
@@ -201,12 +210,15 @@ def _loop_together(osc: Oscillator, belts: Array) -> tuple[Loop, Array]:
 
 
 class SlidingExchange(AbstractCycleCondition):
-    """Two belts run at one velocity: where both touch, the cycle changes from one to the other.
+    """Two belts have one velocity: where both touch, the cycle changes from one to the other.
 
     With laws that jump, or belts that hold differently, there may be another cycle beyond, or none.
-    Where it sticks to both belts, one after the other, the slip arc between them takes no time at
-    the point, like the square root of the difference of the velocities; then the cycle is found
-    that sticks to both at once.
+    Where it sticks to both belts, one after the other, the duration of the slip arc between them
+    vanishes at the point like the square root of the difference of the velocities; then the cycle
+    that sticks to both at once is found.
+
+    Args:
+        belts: Numbers of the two belts.
     """
 
     belts: tuple[int, int]
@@ -248,7 +260,8 @@ class SlidingExchange(AbstractCycleCondition):
         stopping = trail.stopping()
         if stopping is None:
             return None
-        # Both belts come to rest at once, so what is free goes in proportion with the velocity.
+        # Both belts come to rest at once, so the free parameter varies in proportion to the
+        # velocity.
         (before, last), v = trail.values[1:, 1 - stopping.held], stopping.velocities
         free = float(last - v[-1] * ((last - before) / (v[-1] - v[-2])))
         values = (free, stopping.value) if stopping.held else (stopping.value, free)

@@ -1,12 +1,12 @@
 """Curves of bifurcation points in two parameters: `bifurcation_curve`.
 
-A condition's own system of equations, regular at the point, stays regular along its curve, so with
-one unknown more, the second parameter, pseudo-arclength follows it (see `continuation`), turning
-points included. The signature is fixed while it lasts. Functions are watched that vanish where two
-conditions hold at once: the velocities of the belts and their differences on every curve, and what
-the condition's system names besides. Where one changes its sign the curve is solved for its zero, a
-point of codimension two. There the signature may change; the condition is then refined anew just
-beyond, and the curve goes on from there with the signature that is found.
+A condition's own system of equations, regular at the point, stays regular along its curve. With one
+more unknown, the second parameter, pseudo-arclength continuation follows it (see `continuation`),
+turning points included. The signature is fixed while it lasts. Watched are functions that vanish
+where two conditions hold at once: the velocities of the belts and their differences on every curve,
+and those that the condition's system names. Where one changes its sign the system is solved for its
+zero, a point of codimension two. There the signature may change; the condition is then refined anew
+just beyond, and the curve goes on with the signature that is found.
 """
 
 from collections.abc import Callable
@@ -26,7 +26,7 @@ from ..checks import (
     require,
     require_value,
 )
-from ..cycles.attractors import PLACE_DIMENSIONS
+from ..cycles.attractors import PLACE_DIMENSIONS, distance
 from ..model.oscillator import Oscillator, has_clock
 from ..model.own_units import own_length, quantity, rescaled
 from ..model.parameters import leaf_index
@@ -42,23 +42,30 @@ from .tracks import Track, special_between
 if TYPE_CHECKING:
     import pandas
 
-#: After so many points the steps of integration are spread anew.
+#: Number of points after which the integration steps are distributed anew.
 REMESH = 10
-#: A cycle changes by less in a step, relative to its size; a fixed point by less. Along curves of
-#: classes (b), (c) and (d) it was 0.15 at most.
+#: Largest change of a cycle or fixed point in a step, relative to its size. Along curves of classes
+#: (b), (c) and (d) it was 0.15 at most.
 FAR = 0.2
 
 
 class BifurcationCurve(eqx.Module):
     """A curve of bifurcation points in two parameters; what `bifurcation_curve` returns.
 
-    condition: that of the point it began with; values: of the parameters, [rows, 2]; classes: of
-    the condition that holds there, a row each, and kinds: their names; multiplier: of the cycle
-    without the stick phase that vanishes, [rows], NaN where there is none; residual: [rows];
-    places: of the cycle, or of the fixed point, smallest and largest x1, the same of x2, and the
-    period, [rows, 5], NaN where there is none; special: points of codimension two, in order; ends:
-    why it ends at the first and the last row; names: of the parameters.
     `path`, `table()` and `plot()` have rows and special points together.
+
+    Attributes:
+        condition: The condition of the point where it began.
+        values: Values of the two parameters, [rows, 2].
+        classes: Class of the condition that holds at each row.
+        multiplier: Multiplier of the cycle without the stick phase that vanishes, [rows], NaN where
+            there is none.
+        residual: Largest error in the defining equations, [rows].
+        places: Smallest and largest x1, the same of x2, and the period, of the cycle or the fixed
+            point, [rows, 5], NaN where there is none.
+        special: Points of codimension two, in order.
+        ends: Why it ends at the first and the last row.
+        names: Names of the parameters.
     """
 
     condition: AbstractCondition = eqx.field(static=True)
@@ -76,7 +83,7 @@ class BifurcationCurve(eqx.Module):
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Names of the conditions that hold, a row each."""
+        """Names of the conditions that hold at the rows."""
         return tuple(kind.__name__ for kind in self.classes)
 
     @property
@@ -86,10 +93,13 @@ class BifurcationCurve(eqx.Module):
         return np.array(list(at))
 
     def table(self, names: tuple[str, str] | None = None) -> "pandas.DataFrame":
-        """The rows and special points in order.
+        """Returns a row for each row of the curve and each special point, in order.
 
-        condition, belts: what holds there; the two parameters, under `names` (None: those of the
-        curve); multiplier, residual: as above; special: kind and belts of a special point, else "".
+        Columns: condition, belts (of what holds there), the two parameters, multiplier, residual,
+        special (kind and belts of a special point, else "").
+
+        Args:
+            names: Names for the columns of the parameters; None: those of the curve.
         """
         belts, kinds = self.condition.belts_concerned, self.kinds
         rows, kind = [], kinds[0]
@@ -113,25 +123,32 @@ class BifurcationCurve(eqx.Module):
         return table_of(rows)
 
     def in_order(self) -> list[int | SpecialPoint]:
-        """The numbers of the rows, and the special points at their places among them."""
+        """Numbers of the rows, with the special points at their places among them."""
         path, order = self.values, list[int | SpecialPoint](range(len(self)))
         for point in self.special:
             at = np.array(point.values)
             ends = [np.hypot(*(path[i] - at)) for i in (0, -1)]
             gaps = np.hypot(*(path[1:] - path[:-1]).T)
             detour = np.hypot(*(path[:-1] - at).T) + np.hypot(*(path[1:] - at).T) - gaps
-            # At an end where that is nearer than a way round by it between two rows.
+            # At an end, where that is nearer than the detour between two rows.
             place = int(np.argmin([ends[0], *detour, ends[1]]))
             path = np.insert(path, place, at, axis=0)
             order.insert(place, point)
         return order
 
     def is_named(self, end: int) -> bool:
-        """Whether it ends, at its first row, 0, or its last one, -1, in a special point."""
+        """Whether the end at its first row (0) or last row (-1) is a special point."""
         return isinstance(self.in_order()[end], SpecialPoint)
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw it into the axes `ax` (None: new ones), which are returned."""
+        """Draws the curve in the plane of the two parameters.
+
+        Args:
+            ax: Axes; None makes new ones.
+
+        Returns:
+            The axes.
+        """
         return draw(self, ax)
 
     def __repr__(self) -> str:
@@ -145,7 +162,7 @@ class BifurcationCurve(eqx.Module):
 
 
 def given_curve(curve: BifurcationCurve, variation: Variation) -> BifurcationCurve:
-    """A curve that was found in own units, in those of whoever gave what is varied."""
+    """A curve that was found in own units, in the units of the given variation."""
     if variation.units is None:
         return curve
     length, units = variation.units.length, variation.units.parameters
@@ -166,18 +183,27 @@ def bifurcation_curve(
     step: float = 0.01,
     max_points: int = 1000,
 ) -> BifurcationCurve:
-    """The curve of a bifurcation point in two parameters, to both sides of it.
+    """Follows a bifurcation point in two parameters, to both sides.
 
-    point: from `refine` or `scan`, with status OK; where: selects the two parameters, or is a
-    function of both that returns the oscillator, `make(p, q)`; span: first and last value of each;
-    at: see below; step: the longest way between neighbours, both parameters measured such that a
-    change by one changes some number of the dimensionless oscillator by one, and none by more;
-    max_points: on each side; `ends` says where the curve is cut off for that. `ValueError` names
-    an impossible argument.
+    With a function `make(p, q)` the curve begins where make(p, q) is the oscillator of the point,
+    however the point was found: with `make` at a fixed q, or in any other way.
 
-    With `make` the curve begins where make(p, q) is the oscillator of the point, however that was
-    found: with `make` at a fixed q, or in any other way. So (p, q) need not be told; where one
-    oscillator is at several places of the plane (of `p**2`, say), `at` is near the one meant.
+    Args:
+        point: From `refine` or `scan`, with status OK.
+        where: Selects the two parameters; or a function of both that returns the oscillator,
+            `make(p, q)`.
+        span: First and last value of each parameter.
+        at: Values (p, q) near the point; needed only where one oscillator is at several places of
+            the plane (of `p**2`, for example).
+        step: Largest distance between neighbours, in units of the parameters in which a change by 1
+            changes some number of the dimensionless oscillator by 1, and none by more.
+        max_points: Largest number of points on each side; `ends` says where it cut the curve off.
+
+    Returns:
+        The `BifurcationCurve`.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
     require_value(
         isinstance(point, BifurcationPoint),
@@ -216,7 +242,7 @@ def bifurcation_curve(
 
 
 def _varied_by_two(osc: Oscillator, where: Any, at: Any, limits: np.ndarray) -> Variation:
-    """What is varied: two leaves of the oscillator, or what a function of two numbers gives."""
+    """The variation of two leaves of the oscillator, or of a function's two arguments."""
     if callable(where):
         values = tuple(np.mean(limits, axis=1).tolist() if at is None else at.tolist())
         make: Any = where
@@ -238,9 +264,9 @@ def follow_point(
     step: float,
     max_points: int = 1000,
 ) -> BifurcationCurve:
-    """The curve of a point at `start`, [2], in what is varied, between limits, [2, 2].
+    """The curve of a point at `start`, [2], within limits, [2, 2].
 
-    step: with both parameters in units by which they make the same difference.
+    step: in units in which both parameters make the same difference.
     """
     units = np.asarray(variation.family(start).units)
     measured, ends = variation.measured_in(units), limits / units[:, None]
@@ -272,8 +298,7 @@ def follow_point(
 
 def is_elsewhere(place: np.ndarray, other: np.ndarray, far: float) -> bool:
     """Whether two places a step or less apart are of two cycles, or fixed points, where known."""
-    size = max(np.ptp(place[:4]), np.ptp(other[:4]), far)
-    return bool(np.max(np.abs(place - other)[:4]) > far * size)
+    return bool(distance(place[:4], other[:4], least=far) > far)
 
 
 # --- going along ----------------------------------------------------------------------------------
@@ -324,7 +349,7 @@ def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: f
         if beyond is None and end is not Stop.POINT_COUNT:
             return _ended(problem, rows, special, end)
         if beyond is None:
-            # The same curve, its mesh spread anew.
+            # The same curve with a new mesh.
             track, u, direction = track.remeshed(last, points[-1][0].tangent)
             continue
         # The signature has changed between the last two points.
@@ -337,7 +362,7 @@ def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: f
         track, u = Track.begun(problem.variation, *further)
         direction = track.tangent(u)
         direction = direction * np.sign(direction[-2:] @ (u[-2:] - centre))
-        rows.append(_row_at(problem, track, u, track.look(u)))
+        rows.append(_row_at(problem, track, u, track.seen_at(u)))
 
 
 def _ended(
@@ -361,8 +386,11 @@ def _end_at_rest(problem: _Problem, rows: list[_Row], near: float) -> SpecialPoi
 
 
 class _Leg(NamedTuple):
-    """Points with what is seen there, where there is such a motion; the next one, where there is
-    none; the points of codimension two between them."""
+    """A leg of a curve.
+
+    points: with what is seen there, where the motion exists; special: points of codimension two
+    between them; beyond: the next point, where it does not exist.
+    """
 
     points: list[tuple[CurvePoint, Seen]]
     special: list[SpecialPoint]
@@ -375,7 +403,7 @@ def _leg(problem: _Problem, track: Track, u, direction, origin) -> _Leg:
     for at in _points_along(problem, track, u, direction):
         if points:
             at = _closing(track, points[-1][0], at, origin) or at
-        points.append((at, track.look(at.u)))
+        points.append((at, track.seen_at(at.u)))
         if len(points) > 1:
             special += special_between(track, problem.limits, points[-2], points[-1])
         if not points[-1][1].exists:
@@ -424,10 +452,8 @@ def _row_at(problem: _Problem, track: Track, u: np.ndarray, seen: Seen) -> _Row:
 def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray, place: np.ndarray):
     """The point of the same condition just beyond a change of signature, and where, or None.
 
-    It is the same cycle, in much the same place.
-
-    The curve may have a corner there. So it is looked for all around the change, less where the
-    curve came from.
+    It has to be the same cycle, at about the same place. The curve may have a corner there, so the
+    search goes all around the change, except where the curve came from.
     """
     condition = problem.condition
     came_from = (before - centre) / max(float(np.linalg.norm(before - centre)), 1e-12)
@@ -438,7 +464,7 @@ def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray, place: np
             held = problem.variation.held(1 - free, float(values[1 - free]))
             for offset in (-1.0, -0.5, -0.25, 0.0, 0.25, 0.5, 1.0):
                 guess = float(values[free]) + offset * problem.step
-                point = condition.found_from(held, guess)
+                point = condition.named_point_from(held, guess)
                 if point is None or is_elsewhere(point.place, place, FAR):
                     continue
                 if point.condition.lineage != condition.lineage:
@@ -456,15 +482,18 @@ def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray, place: np
 
 
 def _limit(problem: _Problem, track: Track, rows: list[_Row], u, end: Stop):
-    """What the curve ends in where there is no such motion, if that is near its point u."""
+    """The point in which the curve ends where the motion ceases to exist, if it is near its
+    point u."""
     values = np.array([row.values for row in rows[-3:]])
     trail = Trail(problem.variation, problem.step, values, track.system, track.unknowns(u), end)
     return problem.condition.limit(trail)
 
 
 def _towards(problem: _Problem, last: np.ndarray, limit: SpecialPoint) -> list[_Row]:
-    """Rows between the last one and a belt at rest, where the curve bends: each half as far from
-    there as the one before."""
+    """Rows between the last one and a belt at rest, where the curve bends.
+
+    Each is half as far from the end as the one before.
+    """
     condition, end = problem.condition, np.array(limit.values)
     if not condition.bends:
         return []
@@ -473,7 +502,7 @@ def _towards(problem: _Problem, last: np.ndarray, limit: SpecialPoint) -> list[_
     for part in 0.5 ** np.arange(1, 6):
         guess = end + part * (last - end)
         along = problem.variation.held(held, float(guess[held]))
-        point = condition.found_from(along, float(guess[1 - held]))
+        point = condition.named_point_from(along, float(guess[1 - held]))
         if point is None or abs(float(point.value) - guess[1 - held]) > problem.step:
             break
         guess[1 - held] = float(point.value)

@@ -1,13 +1,13 @@
 """Equilibria and cycles along a path in one parameter: `bifurcation_diagram`.
 
-A bifurcation diagram is what `scan` leaves between its points, filled in. In the stretch between
-two neighbouring points nothing changes in kind, so every equilibrium and every cycle in it can be
-computed at as many values as are wanted, all at once: the attracting cycles from where the label
-of the stretch says that they are reached from, the unstable ones around stable equilibria. The
-values are denser towards the points, where branches go like square roots. At a point, what ends on
-one side goes on as what begins there at the same place: through a Hopf point with the other
-stability, through a grazing point or an exchange with another signature, and at a nonsmooth fold
-back on the same side, from stable to unstable.
+A bifurcation diagram fills in what lies between the points of `scan`. Between two neighbouring
+points nothing changes in kind, so every equilibrium and every cycle there can be computed at any
+number of values, all at once: the attracting cycles from the loops of the label of the stretch, the
+unstable ones around stable equilibria. The values are denser towards the points, where branches go
+like square roots. At a point, the branch that ends on one side continues with the one that begins
+there at the same place: through a Hopf point with the other stability, through a grazing point or
+an exchange with another signature, and at a nonsmooth fold back on the same side, from stable to
+unstable.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -22,11 +22,12 @@ import numpy as np
 
 from ..activity import announced, note_progress
 from ..checks import as_whole, outside_of_traces, require, require_value
-from ..cycles.attractors import MOMENT
+from ..cycles.attractors import MAYBE_SAME, MOMENT, distance
 from ..cycles.chains import Loop, cut
 from ..cycles.clocked import turns_of
 from ..cycles.cycle import Cycle, exactly, polish, warn_of_fast_loops
 from ..cycles.periodic import PeriodicMotion
+from ..cycles.unstable import from_starts
 from ..model.equilibria import candidates
 from ..model.events import signature_name
 from ..model.oscillator import Oscillator, has_clock
@@ -47,20 +48,30 @@ from .scan import by_value, edges_touched, is_at_one_value, search
 if TYPE_CHECKING:
     import pandas
 
-#: Ends of two pieces of a branch are one place if they differ by less, relative to their size.
-SAME = 1e-2
+#: Smallest size by which distances between ends of branches are measured.
+LEAST_SIZE = 0.1
 
 
 class Branch(eqx.Module):
-    """Equilibria or cycles along a path in one parameter: a struct of arrays, a row a value.
+    """Equilibria or cycles along a path in one parameter: a struct of arrays, one row for each
+    value.
 
-    kind: "equilibrium" or "cycle". values: of the parameter, [rows]; they turn back at a fold.
-    stable, neutral (a centre, see `Equilibria`; no cycle is), [rows]. x1_min, x1_max, x2_min,
-    x2_max: the range of the motion, [rows]; of a segment of pseudo-equilibria its ends. period,
-    multiplier (the nontrivial one): of a cycle, else NaN.
-    stick_durations, stick_velocities: per loop, and of the belt over omega, [rows, belts]; NaN
-    where a cycle does not stick to that belt. cycles: a `Cycle` a row, of equilibria none; of
-    forced oscillators a `PeriodicMotion`, whose larger multiplier is told by its real part.
+    Attributes:
+        kind: "equilibrium" or "cycle".
+        values: Values of the parameter, [rows]; they turn back at a fold.
+        stable: Stability, [rows].
+        neutral: Whether it is a centre, see `Equilibria`, [rows]; no cycle is.
+        x1_min: Smallest x1 of the motion, [rows]; for a segment of pseudo-equilibria its end.
+        x1_max: Largest x1, likewise.
+        x2_min: Smallest x2, likewise.
+        x2_max: Largest x2, likewise.
+        period: Periods of cycles, else NaN, [rows].
+        multiplier: Nontrivial multipliers of cycles, else NaN, [rows].
+        stick_durations: Time stuck to each belt in one loop, [rows, belts]; NaN where a cycle does
+            not stick to that belt.
+        stick_velocities: Velocity of the belt over omega, likewise.
+        cycles: A `Cycle` for each row; none for equilibria. For forced oscillators a
+            `PeriodicMotion` for each row; `multiplier` is then the real part of the larger one.
     """
 
     kind: str = eqx.field(static=True)
@@ -79,24 +90,26 @@ class Branch(eqx.Module):
 
     @property
     def amplitude(self) -> np.ndarray:
-        """Half the range of x1 of a cycle, 0 of what rests, [rows]."""
+        """Half the range of x1 for cycles, 0 for equilibria, [rows]."""
         moves = self.kind == "cycle"
         return 0.5 * (self.x1_max - self.x1_min) if moves else np.zeros(len(self))
 
     def evaluated(self, functional: Callable[[Cycle], Any]) -> np.ndarray:
-        """A functional of the cycles, [rows]: NaN where there is none. It is given one known
-        `Cycle` after another, so it need not be of what JAX can trace."""
+        """Values of a functional of the cycles, [rows], NaN where there is none.
+
+        The functional gets one known `Cycle` after another, so JAX need not be able to trace it.
+        """
         if not self.cycles:
             return np.full(len(self), np.nan)
         values = [np.asarray(functional(cycle)) for cycle in self.cycles]
         for value in values:
             fits = value.ndim == 0 and np.issubdtype(value.dtype, np.number)
-            told = f"one that returns {value.dtype}{list(value.shape)}"
-            require(fits, "quantity", "a function of a cycle that returns one number", told)
+            returned = f"one that returns {value.dtype}{list(value.shape)}"
+            require(fits, "quantity", "a function of a cycle that returns one number", returned)
         return np.array(values, float)
 
     def columns(self) -> dict[str, Any]:
-        """What the table of a diagram tells of its rows."""
+        """Columns of the table of a diagram for its rows."""
         names = ("stable", "neutral", "x1_min", "x1_max", "x2_min", "x2_max", "period", "amplitude")
         events = [signature_name(cycle.signature) for cycle in self.cycles]
         return {
@@ -121,15 +134,21 @@ class Branch(eqx.Module):
 
 
 class BifurcationDiagram(eqx.Module):
-    """What `bifurcation_diagram` returns.
+    """Branches and special points along a parameter; what `bifurcation_diagram` returns.
 
-    points: the special points in order, as from `scan`, and those at which an unstable cycle
-    touches a contact edge; branches: of equilibria, then of cycles; regions: (first, last, name) of
-    every stretch between points of `scan`, named as those of `RegionMap`; oscillator: the one that
-    was given, of a function that at the first value; name: of the parameter, as the path to it, or
-    that of the function's argument; as_paper: whether the path lies in the plane of the paper's
-    Fig. 6, so that pictures show the names of the regions. `table()` has all rows and points,
-    `plot()` draws it.
+    `table()` has all rows and points, `plot()` draws them.
+
+    Attributes:
+        points: The special points in order, as from `scan`, and those at which an unstable cycle
+            touches a contact edge.
+        branches: Branches of equilibria, then of cycles.
+        regions: (first, last, name) for every stretch between points of `scan`, with names as in
+            `RegionMap`.
+        oscillator: The given oscillator; for a function the one at the first value.
+        name: Name of the parameter: its path, or the name of the function's argument.
+        as_paper: Whether the path lies in the plane of the paper's Fig. 6, so that pictures show
+            the names of the regions.
+        is_argument: Whether `name` is that of a function's argument.
     """
 
     points: tuple[BifurcationPoint, ...]
@@ -141,13 +160,13 @@ class BifurcationDiagram(eqx.Module):
     is_argument: bool = eqx.field(static=True, default=False)
 
     def table(self) -> "pandas.DataFrame":
-        """A row for each row of each branch, in order, and then for each special point.
+        """Returns a row for each row of each branch, in order, and then for each special point.
 
         Columns: branch (its number; missing for a point), kind ("equilibrium", "cycle", or the
         condition of a point), belts and type (of a point), value (of the parameter), stable and
-        neutral (missing for a point), x1_min, x1_max, x2_min, x2_max, period (NaN of what rests),
-        amplitude (half the range of x1; 0 of what rests), multiplier, stick_duration_0, ... of each
-        belt (NaN where it does not stick to that), signature (the events of a cycle, as in
+        neutral (missing for a point), x1_min, x1_max, x2_min, x2_max, period (NaN at rest),
+        amplitude (half the range of x1; 0 at rest), multiplier, stick_duration_0, ... of each belt
+        (NaN where the cycle does not stick to it), signature (the events of a cycle, as in
         `Cycle.table`).
         """
         rows = [
@@ -156,7 +175,7 @@ class BifurcationDiagram(eqx.Module):
             for row in table_of(branch.columns()).to_dict("records")
         ]
         table = table_of([*rows, *map(_row_of_point, self.points)])
-        # A point is of no branch, and neither stable nor unstable.
+        # A point belongs to no branch, and is neither stable nor unstable.
         return (
             table.astype({"branch": "Int64", "stable": "boolean", "neutral": "boolean"})
             if len(table)
@@ -164,19 +183,26 @@ class BifurcationDiagram(eqx.Module):
         )
 
     def plot(self, ax: Any = None, *, quantity: str | Callable[[Cycle], Any] | None = None) -> Any:
-        """Draw it into the axes `ax` (None: new ones), which are returned.
+        """Draws a quantity over the parameter.
 
-        quantity: what is drawn over the parameter.
+        The quantity may be
 
-        - "amplitude": half the range of x1; 0 of equilibria.
-        - "x1": the smallest and the largest.
-        - "x2": as in the paper's Figs. 3 and 7. Equilibria at x2 = 0, cycles that stick by the
-          velocity of each belt that they stick to, others by their largest x2.
+        - "amplitude": half the range of x1; 0 for equilibria.
+        - "x1": the smallest and the largest x1.
+        - "x2": as in the paper's Figs. 3 and 7. Equilibria at x2 = 0, cycles that stick at the
+          velocity of each belt that they stick to, others at their largest x2.
         - "period": of cycles.
-        - a functional of cycles, such as `jb.stick_fraction`, or a function of your own that takes
-          a `Cycle` and returns a number: of cycles, stable and unstable.
-        - None: "amplitude" where a cycle sticks, for x2 would draw but the velocity of its belt;
+        - a functional of cycles, such as `jb.stick_fraction`, or a function that takes a `Cycle`
+          and returns a number: for cycles, stable and unstable.
+        - None: "amplitude" where a cycle sticks, as x2 would only show the velocity of its belt;
           else "x2", and "x1" where there is no cycle.
+
+        Args:
+            ax: Axes; None makes new ones.
+            quantity: The quantity, see above.
+
+        Returns:
+            The axes.
         """
         return draw(self, ax, quantity=quantity)
 
@@ -201,22 +227,32 @@ def bifurcation_diagram(
 ) -> BifurcationDiagram:
     """Equilibria and cycles, stable and unstable, along a path in one parameter.
 
-    osc, where, span, resolution: as for `scan`, which finds the special points. rows: about how
-    many values of the parameter are computed. `ValueError` names an impossible argument.
+    Args:
+        osc: An oscillator, or a function of the parameter that returns it, as for `scan`.
+        where: Selects the parameter, as for `scan`; None with a function.
+        span: First and last value of the parameter.
+        rows: Approximate number of values of the parameter.
+        resolution: As for `scan`, which finds the special points.
+        start: For a forced oscillator only, whose diagram is the branch of one periodic motion,
+            stable and unstable, with the points on it, and the branches that leave it at period
+            doublings (rows and resolution do not count): that motion, or a start (x1, x2) at t = 0
+            that leads to it with the parameter in the middle of the span; None: from where one is
+            found. A branch ends where no motion is found beyond a point.
 
-    Of a forced oscillator: the branch of one periodic motion, stable and unstable, with the points
-    on it, and the branches that leave it at period doublings; rows and resolution do not count.
-    start: that motion, or a start (x1, x2) at t = 0 that leads to it with the parameter in the
-    middle of the span (None: from where one is found). A branch ends where no motion is found
-    beyond a point.
+    Returns:
+        The `BifurcationDiagram`.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
     rows, resolution = as_whole(rows, "rows"), as_whole(resolution, "resolution")
     if _is_forced(osc, where, span):
         return _forced_diagram(osc, where, span, start)
     require_value(start is None, "start", "left out where there is no forcing", start)
     path = ParameterPath(osc, where, span)
-    points = search(path, resolution)
-    # A point on an end of the span has one side only, and what holds all along none.
+    osc_at_first = path.at(path.first)
+    points = search(path, resolution, ahead=[lambda: from_starts(osc_at_first)])
+    # A point on an end of the span has one side only; a condition that holds all along has none.
     bounds = [point for point in points if int(point.status) != Status.DEGENERATE]
     inner = [point for point in bounds if path.first < float(point.value) < path.last]
     special: dict[float, list[BifurcationPoint]] = {}
@@ -227,7 +263,7 @@ def bifurcation_diagram(
     ends = [path.first, *special, path.last]
     stretches = list(pairwise(ends))
     nodes = [_nodes(path, a, b, rows) for a, b in stretches]
-    path.look(np.concatenate(nodes))
+    path.find_labels(np.concatenate(nodes))
     middles = [float(values[len(values) // 2]) for values in nodes]
     labels = [path.label(value) for value in middles]
     note_progress(f"branches between {len(points)} points")
@@ -236,7 +272,7 @@ def bifurcation_diagram(
         points = by_value([*points, *found])
         at = [float(point.value) for point in found if point.status == Status.OK]
         nodes[stretch] = np.sort(np.append(nodes[stretch], at))
-    path.look(np.concatenate(nodes))
+    path.find_labels(np.concatenate(nodes))
     if any(np.all(np.isfinite(belt.friction.measured_to)) for belt in path.at(path.first).belts):
         loops = ((path.at(v), one.loop) for v, found in path.cycles.items() for one in found)
         fast = ((osc, loop, np.asarray(loop.entries)[:, 1]) for osc, loop in loops)
@@ -362,7 +398,7 @@ def _row_of_point(point: BifurcationPoint) -> dict[str, Any]:
 
 def _nodes(path: ParameterPath, a: float, b: float, rows: int) -> np.ndarray:
     """Values from a to b, dense at both ends, which are left out where they are special."""
-    # Short stretches are no less curved than long ones: of fewer rows the corners would be seen.
+    # Short stretches are no less curved than long ones: with fewer rows corners would be visible.
     count = max(9, rows // 9, round(rows * (b - a) / path.length))
     inner = 0.5 * (1 - np.cos(np.linspace(0, np.pi, count)))
     first = path.beside(a)[1] if a in path.breaks or a != path.first else a
@@ -371,8 +407,10 @@ def _nodes(path: ParameterPath, a: float, b: float, rows: int) -> np.ndarray:
 
 
 def _separated(labels: Sequence[Label]) -> list[tuple[int, int]]:
-    """The stretches with unstable cycles, between equilibria and cycles that attract, and the
-    number of each such equilibrium."""
+    """Stretches with unstable cycles between equilibria and cycles that attract.
+
+    With the number of each such equilibrium.
+    """
     return [
         (stretch, around)
         for stretch, label in enumerate(labels)
@@ -423,7 +461,7 @@ def _cycle_pieces(
 ) -> list[_Piece]:
     wanted: list[tuple[int, np.ndarray, list[Loop]]] = []
     for stretch in range(len(labels)):
-        for loops in path.followed(nodes[stretch].tolist()):
+        for loops in path.strands(nodes[stretch].tolist()):
             wanted.append((stretch, np.array(list(loops)), list(loops.values())))
     pieces = []
     if wanted:
@@ -490,16 +528,16 @@ def _row_of_branch(cycle: Cycle) -> _Rows:
 
 
 def _consecutive(groups: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """The row numbers of each group, when all stand one after another."""
+    """Row numbers of each group, when all groups stand one after another."""
     ends = np.cumsum([len(group) for group in groups])
     return [np.arange(end - len(group), end) for group, end in zip(groups, ends, strict=True)]
 
 
-# One by one: so one program serves any number of them.
+# One by one, so that one program serves any number of them.
 
 
 def _stacked(program, items: Iterable[Any]) -> Any:
-    """What the program gives of each, as NumPy arrays of many rows."""
+    """Results of a program for each item, as NumPy arrays of many rows."""
     rows = [jax.tree.map(np.asarray, program(item)) for item in items]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
 
@@ -509,7 +547,7 @@ def _attracting(path: ParameterPath, values: np.ndarray, loops: Sequence[Loop]) 
 
     def solved(osc: Oscillator, loop: Loop) -> Cycle:
         cycle = polish(osc, loop, ok)
-        # Steps that are too long for the law; a branch must not end for that.
+        # The steps are too long for the law; a branch must not end for that.
         return exactly(osc, loop, ok) if int(cycle.status) == Status.NO_CONVERGENCE else cycle
 
     pairs = zip(values, cut(loops), strict=True)
@@ -520,7 +558,7 @@ def _attracting(path: ParameterPath, values: np.ndarray, loops: Sequence[Loop]) 
 
 
 class _End(NamedTuple):
-    """An end of a piece (its number, and whether it is the right one), and where it is."""
+    """An end of a piece: number of the piece, whether it is the right end, and its place."""
 
     piece: int
     right: bool
@@ -528,8 +566,11 @@ class _End(NamedTuple):
 
 
 def _joined(pieces: Sequence[_Piece], special: Sequence[list[BifurcationPoint]]) -> list[Branch]:
-    """Branches through the points, those at one value together: two ends of pieces that are one
-    place there belong together."""
+    """Joins pieces to branches.
+
+    special: the points between stretches, those at one value together. Two ends of pieces at the
+    same place there belong together.
+    """
     partner: dict[tuple[int, bool], tuple[int, bool]] = {}
     for at, points in enumerate(special):
         if not all(point.condition.joins for point in points):
@@ -540,11 +581,11 @@ def _joined(pieces: Sequence[_Piece], special: Sequence[list[BifurcationPoint]])
             if piece.stretch in (at, at + 1)
         ]
         pairs = sorted(
-            (_distance(a, b), i, j) for (i, a), (j, b) in combinations(enumerate(ends), 2)
+            (_between(a, b), i, j) for (i, a), (j, b) in combinations(enumerate(ends), 2)
         )
         taken: set[int] = set()
-        for distance, i, j in pairs:
-            if distance < SAME and not taken & {i, j}:
+        for away, i, j in pairs:
+            if away < MAYBE_SAME and not taken & {i, j}:
                 taken |= {i, j}
                 for a, b in ((ends[i], ends[j]), (ends[j], ends[i])):
                     partner[a.piece, a.right] = (b.piece, b.right)
@@ -568,11 +609,10 @@ def _end(number: int, piece: _Piece, *, right: bool) -> _End:
     return _End(number, right, (branch.kind, float(branch.x1_min[row]), float(branch.x1_max[row])))
 
 
-def _distance(a: _End, b: _End) -> float:
+def _between(a: _End, b: _End) -> float:
     """How far apart two ends are, relative to the motion there."""
     (kind, *x), (other, *y) = a.place, b.place
-    size = max(x[1] - x[0], y[1] - y[0], 0.1)
-    return max(abs(x[0] - y[0]), abs(x[1] - y[1])) / size if kind == other else np.inf
+    return distance(x, y, least=LEAST_SIZE) if kind == other else np.inf
 
 
 def _reversed(branch: Branch) -> Branch:

@@ -4,13 +4,14 @@ There is no cycle at these points, and no unknown but the parameter.
 
 - `BoundaryEquilibrium`: at rest on an edge, the force on one of its sides is zero, or as large as
   belts at rest there can hold: a fixed point, or the end of a segment, comes to lie on the edge. It
-  goes on beyond the point (persistence) if the other side of the edge pushes to it, as a
-  pseudo-focus, or holds the mass; if that pushes away, it meets the saddle of the edge and both
-  vanish (annihilation). Where the static limit of a belt at rest exceeds mu(0), orbits end only in
-  that part of the segment where mu(0) is enough; the end of that part may come to the edge, too.
+  continues beyond the point (persistence) if the other side of the edge pushes to it, as a
+  pseudo-focus, or holds the mass; if that side pushes away, it meets the saddle of the edge and
+  both vanish (annihilation). Where the static limit of a belt at rest exceeds mu(0), orbits end
+  only in that part of the segment where mu(0) is enough; the end of that part may come to the edge,
+  too.
 - `PseudoHopf`: at a pseudo-focus the leading term by which loops grow or shrink is zero. With the
-  next one, of third order, `|x2|` at the edge obeys r' = rate r + a r^3, see `edge_focus`, and
-  the cycle that is born has r^2 = -rate/a.
+  next one, of third order, `|x2|` at the edge obeys r' = rate r + a r^3, see `edge_focus`, and the
+  cycle that is born has r^2 = -rate/a.
 
 Boundary equilibria and the pseudo-Hopf point are those of M. di Bernardo, C. Budd, A. Champneys, P.
 Kowalczyk, Piecewise-smooth Dynamical Systems, 2008.
@@ -51,22 +52,22 @@ from .rests import NOTHING, AbstractRestOfSeveral, criticality, limit_near
 from .special import SpecialPoint, Trail
 from .systems import RestSystem, Tests, small_newton, velocity_of
 
-#: A cycle around a pseudo-focus is as large as a velocity if its x2 goes over so many times that,
-#: from minus to plus.
+#: A cycle around a pseudo-focus is as large as a velocity if the range of its x2 is at most so many
+#: times that velocity.
 AS_LARGE = 3.0
 
 
 class _EdgeSystem(RestSystem):
-    """One equation, of what lies at rest on the edge of this number."""
+    """One equation, for the motion at rest on the edge of this number."""
 
     edge: eqx.AbstractVar[Array]
 
     def balance(self, osc: Oscillator) -> Array:
-        """What vanishes."""
+        """The expression that vanishes."""
         raise NotImplementedError
 
     def meets_hopf(self, osc: Oscillator) -> Array:
-        """What vanishes where its curve meets that of a Hopf point, else NaN."""
+        """The expression that vanishes where its curve meets that of a Hopf point, else NaN."""
         raise NotImplementedError
 
     def residual(self, osc, x):
@@ -79,16 +80,16 @@ class _EdgeSystem(RestSystem):
         return {("BoundaryHopf", ()): self.meets_hopf(osc), **self.type_tests(osc)}
 
     def type_tests(self, osc: Oscillator) -> Tests:
-        """What to watch along its curve where the type changes."""
+        """Functions to watch along its curve that vanish where the type changes."""
         raise NotImplementedError
 
 
 class EdgeRest(_EdgeSystem):
-    """What vanishes where an equilibrium lies on an edge.
+    """The equation of an equilibrium on an edge.
 
-    The needed force at rest on one side of it, less what belts at rest there can hold, in one of
-    the two directions (0 where none is at rest). kinetic: whether that is their kinetic friction,
-    so that the part of a segment ends there in which orbits end.
+    The force needed at rest on one side of it, less what belts at rest there can hold in one of the
+    two directions (0 where none is at rest). kinetic: whether the latter is their kinetic friction,
+    so that the part of a segment in which orbits end ends there.
     """
 
     edge: Array
@@ -116,11 +117,11 @@ class EdgeRest(_EdgeSystem):
         return {("DoubleBoundaryEquilibrium", ()): jnp.where(persists, jnp.nan, push)}
 
     def across(self, osc: Oscillator) -> tuple[Array, Array]:
-        """How hard the other side pushes to the edge, and whether an equilibrium is at the edge on
-        both sides of the point whatever this is.
+        """How hard the other side pushes to the edge, and whether the equilibrium persists
+        regardless.
 
-        So it is where belts at rest hold the mass on the other side, and where it is the end of a
-        segment that comes to the edge first.
+        It does where belts at rest hold the mass on the other side, and where the end of a segment
+        that comes to the edge first.
         """
         at, rest = jnp.stack(edges(osc))[self.edge], jnp.zeros(())
         sides = _beside_edge(osc, at)
@@ -133,7 +134,7 @@ class EdgeRest(_EdgeSystem):
         return push, stays | other.any_stuck
 
     def exists(self, osc, x):
-        # Whether the contacts on that side are those, and the kinetic limit is one of its own.
+        # Whether the contacts on that side are those, and the kinetic limit is a separate one.
         at, mode = jnp.stack(edges(osc))[self.edge], mode_of(self.codes)
         left, right = _beside_edge(osc, at)
         jumps = capacity(osc, mode) - kinetic_capacity(osc, mode) > force_rounding(at)
@@ -142,7 +143,7 @@ class EdgeRest(_EdgeSystem):
 
 
 class EdgeBalance(_EdgeSystem):
-    """What vanishes where the pseudo-focus at an edge is neither stable nor unstable."""
+    """The equation of a pseudo-focus that is neither stable nor unstable."""
 
     edge: Array
     left: Mode
@@ -159,7 +160,7 @@ class EdgeBalance(_EdgeSystem):
         return field_at_rest(osc, left, at)[:2], field_at_rest(osc, right, at)[:2]
 
     def balance(self, osc):
-        # The rate of `edge_focus` but for factors: regular where one of the pushes is 0.
+        # The rate of `edge_focus` up to factors: regular where one of the pushes is 0.
         (a_left, trace_left), (a_right, trace_right) = self._sides(osc)
         return trace_right * a_left - trace_left * a_right
 
@@ -191,8 +192,11 @@ class EdgeBalance(_EdgeSystem):
 
 
 def pseudo_hopf_limit(trail: Trail) -> SpecialPoint | None:
-    """Where the cycle of a curve has shrunk to a pseudo-focus at which the rate and the coefficient
-    are zero, if that is near: its own equations are singular there."""
+    """The point where the cycle of a curve has shrunk to a degenerate pseudo-focus, if that is
+    near.
+
+    There the rate and the coefficient are zero, and the cycle's own equations are singular.
+    """
     passed = _edges_passed(trail)
     if np.ptp(trail.x[:, 0]) > 5 * trail.step or not passed.size:
         return None
@@ -220,11 +224,12 @@ def _degenerate_focus(family: Family, edge: Array, guess: Array) -> tuple[Array,
 
 
 def slow_focus_limit(trail: Trail, belt: int) -> SpecialPoint | None:
-    """Where a belt comes to rest, and a cycle around an edge that is as large as its velocity has
-    shrunk to a pseudo-focus, of the rate zero, if that is near.
+    """The point where a belt comes to rest and a cycle has shrunk to a pseudo-focus, if that is
+    near.
 
-    The equations of the cycle lose their digits on the way, like a third power of the velocity. In
-    the limit its growth is that of the pseudo-focus, as beside a pseudo-Hopf point.
+    The cycle around an edge is as large as the velocity of the belt, and the pseudo-focus has the
+    rate zero. The equations of the cycle lose their digits on the way, like a third power of the
+    velocity. In the limit its growth is that of the pseudo-focus, as beside a pseudo-Hopf point.
     """
     if len(trail.values) < 3:
         return None
@@ -249,8 +254,10 @@ def slow_focus_limit(trail: Trail, belt: int) -> SpecialPoint | None:
 
 @jit
 def _slow_focus(family: Family, system: EdgeBalance, belt: Array, guess: Array):
-    """Both parameters where the belt is at rest and the rate of a pseudo-focus zero, its contacts
-    those of a belt that moves, and the error."""
+    """Both parameters where the belt is at rest and the rate of a pseudo-focus zero, and the error.
+
+    Its contacts are those of a belt that moves.
+    """
 
     def equations(family, p):
         osc = family.at(p)
@@ -261,14 +268,14 @@ def _slow_focus(family: Family, system: EdgeBalance, belt: Array, guess: Array):
 
 
 def _edges_passed(trail: Trail) -> np.ndarray:
-    """The numbers of the edges that the cycle of a curve passes."""
+    """Numbers of the edges that the cycle of a curve passes."""
     chain = trail.system.chain
     n, ends = chain.codes.shape[-1], np.asarray(chain.ends)
     return ends[(ends >= n) & (ends < 3 * n)] - n
 
 
 class _EdgeCondition(AbstractRestOfSeveral):
-    """A condition on what lies at rest on a contact edge of a belt."""
+    """A condition on the motion at rest on a contact edge of a belt."""
 
     belt: int | Array
 
@@ -277,7 +284,7 @@ class _EdgeCondition(AbstractRestOfSeveral):
         check_edge(osc, self.belt)
 
     def _systems_at_edges(self, osc: Oscillator) -> tuple[_EdgeSystem, Array]:
-        """One for each edge, and whether it can hold at all, a row each."""
+        """A system for each edge, and whether it can hold at all, a row each."""
         raise NotImplementedError
 
     def systems(self, osc):
@@ -292,8 +299,14 @@ class _EdgeCondition(AbstractRestOfSeveral):
 
 
 class BoundaryEquilibrium(_EdgeCondition):
-    """A fixed point, or the end of a segment, lies on a contact edge of a belt; or the end of that
-    part of a segment in which orbits end, where the static limit of a belt exceeds mu(0)."""
+    """A fixed point, or the end of a segment, lies on a contact edge of a belt.
+
+    Or the end of that part of a segment in which orbits end, where the static limit of a belt
+    exceeds mu(0).
+
+    Args:
+        belt: Number of the belt.
+    """
 
     caption: ClassVar[str] = "rest on edge, belt {belt}"
     line: ClassVar[Line] = Line("rest on edge", "#D55E00")
@@ -314,14 +327,18 @@ class BoundaryEquilibrium(_EdgeCondition):
         return super().between(before, after, edged) if there != then else []
 
     def type_of(self, point):
-        push, persists = _across_edge(self.followed(point)[0], point.oscillator)
+        push, persists = _across_edge(self.system_at(point)[0], point.oscillator)
         if not persists and abs(push) < HOLDS:
             return "degenerate"
         return "persistence" if persists or push > 0 else "annihilation"
 
 
 class PseudoHopf(_EdgeCondition):
-    """The pseudo-focus at a contact edge of a belt changes its stability."""
+    """The pseudo-focus at a contact edge of a belt changes its stability.
+
+    Args:
+        belt: Number of the belt.
+    """
 
     #: Loops around it neither grow nor shrink, and those of a cycle beside it are lost in rounding.
     slow: ClassVar[bool] = True
@@ -334,21 +351,21 @@ class PseudoHopf(_EdgeCondition):
         return systems, jnp.ones(systems.edge.size, bool)
 
     def type_of(self, point):
-        return criticality(*_loop_growth(self.followed(point)[0], point.oscillator))
+        return criticality(*_loop_growth(self.system_at(point)[0], point.oscillator))
 
     def coefficient(self, point):
-        return _loop_growth(self.followed(point)[0], point.oscillator)[0]
+        return _loop_growth(self.system_at(point)[0], point.oscillator)[0]
 
 
 def check_edge(osc: Oscillator, belt: Any, field: str = "belt") -> None:
-    """`ValueError` where a belt has no finite contact edge."""
+    """Raises a `ValueError` if a belt has no finite contact edge."""
     if is_concrete(osc):
         ends = [osc.belts[belt].lower, osc.belts[belt].upper]
         require_value(np.any(np.isfinite(ends)), field, "one with a finite edge", belt)
 
 
 def _edges_of(osc: Oscillator, belt: int | Array) -> tuple[Array, Array]:
-    """The numbers of the lower and the upper edge of a belt."""
+    """Numbers of the lower and the upper edge of a belt."""
     return jnp.asarray(belt), jnp.asarray(belt + len(osc.belts))
 
 
@@ -365,8 +382,7 @@ def _where_nothing_holds(osc: Oscillator, mode: Mode, at: Array) -> Mode:
 
 
 def _edge_rests(osc: Oscillator, belt: int | Array) -> tuple[EdgeRest, Array]:
-    """The equations of a boundary equilibrium at the edges of a belt, and whether each is one of
-    its own, a row each."""
+    """Equations of a boundary equilibrium at the edges of a belt, and whether each is distinct."""
     cases = []
     for edge in _edges_of(osc, belt):
         sides = _beside_edge(osc, jnp.stack(edges(osc))[edge])
@@ -404,7 +420,7 @@ def _loop_growth(system: EdgeBalance, osc: Oscillator) -> tuple[Array, Array]:
 
 
 def _edge_balances(osc: Oscillator, belt: int | Array) -> EdgeBalance:
-    """The equations of the pseudo-foci at the edges of a belt, a row each."""
+    """Equations of the pseudo-foci at the edges of a belt, a row each."""
     positions = jnp.stack(edges(osc))
     cases = [
         EdgeBalance(edge, *_beside_edge(osc, positions[edge])) for edge in _edges_of(osc, belt)

@@ -1,11 +1,11 @@
 """Cycles that touch a contact edge: `GrazingEdge` and `CornerCollision`.
 
-An arc of a cycle ends on a contact edge and in something else at once. With an extremum of x1, the
-orbit is tangent to the edge, x2 = 0; with a boundary r_k = 0 or slip onset, it runs into the corner
-of that and the edge. To one side of the point the edge ends the arc, to the other that does: the
-equation is that the other's guard vanishes, which is linear in the unknowns. A cycle that passes
-the edge and turns back soon after has that excursion left out: with it the equation is of second
-order in the velocity at the edge.
+An arc of a cycle ends on a contact edge and in a second event at once. If that is an extremum of
+x1, the orbit is tangent to the edge, x2 = 0; if it is a boundary r_k = 0 or slip onset, the orbit
+runs into the corner of that and the edge. On one side of the point the edge ends the arc, on the
+other the second event: the equation is that the guard of the other one vanishes, which is linear in
+the unknowns. If a cycle passes the edge and turns back soon after, that excursion is left out: with
+it the equation is of second order in the velocity at the edge.
 
 Grazing and corner collision are the names of M. di Bernardo, C. Budd, A. Champneys, P. Kowalczyk,
 Piecewise-smooth Dynamical Systems, 2008.
@@ -43,10 +43,10 @@ from .systems import CycleSystem, nearest_edge
 
 
 class EdgeContact(CycleSystem):
-    """A cycle of which an arc, `row`, ends on an edge and in something else at once.
+    """A cycle whose arc `row` ends on an edge and in a second event at once.
 
-    One of the two ends the arc; of the other one, `end`, the guard vanishes there in the mode of
-    `codes`. repels: whether the cycle is to be unstable.
+    One of the two ends the arc; the guard of the other one, `end`, vanishes there in the mode of
+    `codes`. repels: whether the cycle has to be unstable.
     """
 
     chain: Chain
@@ -56,15 +56,15 @@ class EdgeContact(CycleSystem):
     repels: Array
 
     def condition(self, osc, z, miss):
-        following = (self.row + 1) % z.shape[0]  # unused arcs hand the state on
+        following = (self.row + 1) % z.shape[0]  # unused arcs pass the state on
         return end_guard(osc, self.codes, self.end, z[following, :2])
 
     def judge(self, osc, z, cycle, slope):
-        # A loop at once after the edge is passed solves the equations, too, but they are singular;
-        # and a cycle that has shrunk to a pseudo-focus meets everything there.
-        loops = cycle.chain.ends[self.row] == Ends(len(osc.belts)).extremum_x1
+        # A cycle with an extremum of x1 at once after the edge solves the equations, too, but there
+        # they are singular; and a cycle that has shrunk to a pseudo-focus meets everything there.
+        turns = cycle.chain.ends[self.row] == Ends(len(osc.belts)).extremum_x1
         shrunk = jnp.ptp(z[:, 0]) < AT_REST
-        fails = loops & (z[self.row, 2] < 1e-6) | shrunk
+        fails = turns & (z[self.row, 2] < 1e-6) | shrunk
         solved = cycle.status == Status.OK
         status = jnp.where(solved & fails, Status.NO_CONVERGENCE.value, cycle.status)
         none = solved & ~(slope > 1) | shrunk & (status == Status.NO_CONVERGENCE)
@@ -81,8 +81,11 @@ class EdgeContact(CycleSystem):
         return tests, True, jnp.nan
 
     def _ends_there(self, z: Array) -> Array:
-        """The arcs that end where and when that of the row does, [arcs]: it, and the one before or
-        after it that ends in the other one of the two, with no time between them."""
+        """The arcs that end where and when that of the row does, [arcs].
+
+        That is the arc itself, and the one before or after it that ends in the other event with no
+        time between them.
+        """
         rows, count = jnp.arange(self.chain.ends.size), jnp.sum(self.chain.used)
         before, after = (self.row - 1) % count, (self.row + 1) % count
         is_there = rows == self.row
@@ -93,11 +96,11 @@ class EdgeContact(CycleSystem):
 
 
 class AbstractEdgeTouch(AbstractCycleCondition):
-    """An arc of a cycle ends on an edge of a belt and in something else at once.
+    """An arc of a cycle ends on an edge of a belt and in a second event at once.
 
-    wanted: 1 an extremum of x1 (grazing), -1 a boundary or slip onset (a corner), 0 either. Of all
-    attracting cycles that which comes nearest to this is taken; repels: of the cycle from
-    `unstable_cycle`, not of an attracting one.
+    Of all attracting cycles the one that comes nearest to this is taken. wanted: 1 for an extremum
+    of x1 (grazing), -1 for a boundary or slip onset (a corner), 0 for either. repels: the cycle is
+    the one from `unstable_cycle`, not an attracting one.
     """
 
     belt: int | Array
@@ -107,11 +110,11 @@ class AbstractEdgeTouch(AbstractCycleCondition):
     @property
     @abc.abstractmethod
     def wanted(self) -> float | Array:
-        """Which of the two kinds is meant."""
+        """The second event: see the class."""
 
     @property
     def repels(self) -> bool:
-        """Whether it is about the unstable cycle."""
+        """Whether the condition is on the unstable cycle."""
         return False
 
     @property
@@ -157,7 +160,7 @@ class AbstractEdgeTouch(AbstractCycleCondition):
         return beginning, jnp.asarray(Status.OK.value)
 
     def distance(self, osc: Oscillator, loop: Loop) -> Array:
-        """How far the nearest end of an arc is from both at once."""
+        """Distance of the nearest end of an arc from both events at once."""
         return self._nearest_end(osc, loop).distance
 
     def _nearest_end(self, osc: Oscillator, loop: Loop) -> "EdgeEnd":
@@ -168,7 +171,7 @@ class AbstractEdgeTouch(AbstractCycleCondition):
         if not is_concrete(point.status) or int(point.status) != Status.NO_CONVERGENCE:
             return point
         loop, _ = guess
-        # Slip onset may be on the edge whatever the parameter is, as at round numbers it is.
+        # Slip onset may be on the edge whatever the parameter is, as happens at round numbers.
         if float(self._nearest_end(osc, loop).distance) > HOLDS:
             return point
         others = EdgeTouch(self.belt, self.wanted, jnp.asarray(np.array(HOLDS)), self.repels)
@@ -186,7 +189,7 @@ class AbstractEdgeTouch(AbstractCycleCondition):
 
 
 class EdgeTouch(AbstractEdgeTouch):
-    """Such an end of whichever kind, and what programs know of both."""
+    """Such an end with either second event, as data for programs."""
 
     meant: float | Array = 0.0
     least: float | Array = -1.0
@@ -206,11 +209,14 @@ class EdgeTouch(AbstractEdgeTouch):
 
 
 class GrazingEdge(AbstractEdgeTouch):
-    """The cycle is tangent to a contact edge of a belt: a loop, an extremum of x1, touches it.
+    """The cycle is tangent to a contact edge of a belt: an extremum of x1 touches it.
 
-    Beyond, the cycle passes the edge; or there is none, where the edge pushes away to both sides.
-    There, too, a cycle that passes the edge ends, with the velocity zero on it.
-    unstable: of the cycle from `unstable_cycle`, not of an attracting one.
+    Beyond, the cycle passes the edge; or there is none, where the edge pushes away to both sides. A
+    cycle that passes the edge ends there, too, with the velocity zero on it.
+
+    Args:
+        belt: Number of the belt.
+        unstable: Whether the cycle is the one from `unstable_cycle`, not an attracting one.
     """
 
     unstable: bool = eqx.field(static=True, default=False)
@@ -228,7 +234,7 @@ class GrazingEdge(AbstractEdgeTouch):
 
     @classmethod
     def between(cls, before, after, edged):
-        # Whether an end of an arc on an edge is a loop or a corner is seen when it is found.
+        # Whether an arc ends on the edge with an extremum or in a corner shows at the solution.
         return [cls(belt) for belt in edged] if before.cycles != after.cycles else []
 
     @classmethod
@@ -236,7 +242,7 @@ class GrazingEdge(AbstractEdgeTouch):
         return [cls(belt, unstable=True) for belt in edged]
 
     def limit(self, trail):
-        """Where the cycle has shrunk to an equilibrium on the edge."""
+        """The point where the cycle has shrunk to an equilibrium on the edge."""
         if trail.end is Stop.POINT_COUNT:
             return None
         return hopf_limit("BoundaryHopf", trail, _guard_at_rest, trail.system.end)
@@ -248,6 +254,9 @@ class CornerCollision(AbstractEdgeTouch):
     It begins, or ceases, to stick to a belt there, or crosses its boundary: beyond, these come in
     another order, or another event comes instead; or, like at a nonsmooth fold, there is no cycle.
     A guess has to lie on a side where there is a cycle; `scan` tries both.
+
+    Args:
+        belt: Number of the belt.
     """
 
     caption: ClassVar[str] = "corner, belt {belt}"
@@ -258,7 +267,8 @@ class CornerCollision(AbstractEdgeTouch):
         return -1.0
 
     def limit(self, trail):
-        """Where the cycle shrinks to a pseudo-focus with the velocity of the boundary's belt."""
+        """The point where the cycle shrinks to a pseudo-focus with the velocity of the
+        boundary's belt."""
         system = trail.system
         belt = min(int(system.end), int(system.chain.ends[system.row]))
         if trail.end is Stop.POINT_COUNT or belt >= system.chain.codes.shape[-1]:
@@ -274,9 +284,9 @@ def _guard_at_rest(osc: Oscillator, codes: Array, x1: Array, end: Array) -> Arra
 
 
 class EdgeEnd(eqx.Module):
-    """The end of an arc that comes nearest to an edge and something else at once.
+    """The end of an arc that comes nearest to an edge and a second event at once.
 
-    distance: from that, inf if there is none; row, end, codes: as for `EdgeContact`; grazes:
+    distance: from these, inf if there is none; row, end, codes: as for `EdgeContact`; grazes:
     whether the orbit would be tangent to the edge, else it would run into a corner.
     """
 
@@ -295,9 +305,10 @@ def end_near_edge(
     wanted: float | Array,
     farther: float | Array = -1.0,
 ) -> EdgeEnd:
-    """Of the ends of the arcs of a loop that nearest to an edge of the belt and something else.
+    """The end of an arc of a loop that is nearest to an edge of the belt and a second event.
 
-    wanted: 1 tangent to the edge, -1 in a corner, 0 either. farther: of those farther from it.
+    wanted: 1 tangent to the edge, -1 in a corner, 0 either. farther: only ends that are farther
+    than this.
     """
     n = len(osc.belts)
     names = Ends(n)
@@ -310,18 +321,18 @@ def end_near_edge(
     extreme = jnp.where(jnp.stack([*idle, jnp.asarray(True)]), extreme, names.extremum_x1)
 
     def distances(codes, end, entry, after, at):
-        """From every end that this arc might have as well; those of stick phases in two modes."""
+        """Distances from every end that this arc might have as well; stick phases in two modes."""
         x1, x2 = at
         on_edge = (end >= n) & (end < 3 * n)
         edge = positions[jnp.clip(end - n, 0, 2 * n - 1)]
         on_edge = on_edge & ((edge == lower) | (edge == upper))
         stuck = jnp.any(codes == 0)
-        # What ends it is something else: how far it is to an edge.
-        loops, meets = jnp.any(end == extreme), (end < n) | (end == names.onset)
-        to_edges = [jnp.where(loops | meets, jnp.abs(x1 - e), jnp.inf) for e in (lower, upper)]
-        # An edge ends it. If that pushes away to both sides: how much further on the orbit would
-        # loop as it was.
-        # It moves there as x1 does on this arc; x2 itself may be zero.
+        # The second event ends the arc: its distance from an edge.
+        turns, meets = jnp.any(end == extreme), (end < n) | (end == names.onset)
+        to_edges = [jnp.where(turns | meets, jnp.abs(x1 - e), jnp.inf) for e in (lower, upper)]
+        # An edge ends the arc. If that pushes away to both sides: the distance to the extremum of
+        # x1 that the orbit would reach without the edge. It moves there in the direction of x1 on
+        # this arc; x2 itself may be zero.
         ahead = jnp.sign(x1 - entry[0])
         push = [ahead * mode_acceleration(osc, mode_of(c), x1, x2) for c in (codes, after)]
         passes = on_edge & ~stuck & (push[0] < 0) & (push[1] > 0)
@@ -333,7 +344,8 @@ def end_near_edge(
             touches = (jnp.abs(codes[i]) < 1.5) | (jnp.abs(after[i]) < 1.5)
             near = on_edge & ~stuck & touches & (jnp.abs(began) > HOLDS)
             to_boundaries.append(jnp.where(near, jnp.abs(r), jnp.inf))
-        # Slip onset may be: in the mode before the edge, or, if it is left by it, in that after.
+        # Slip onset may be near: in the mode before the edge or, if the edge is left by it, in the
+        # mode after.
         held = jnp.where((codes == 0) & (jnp.abs(after) < 1.5), 0.0, after)
         to_onsets = []
         for one in (codes, held):
@@ -341,7 +353,7 @@ def end_near_edge(
             away = jnp.abs(x1 - onset_position(osc, mode_of(one)))
             to_onsets.append(jnp.where(may, away, jnp.inf))
         found = jnp.stack([*to_edges, to_extremum, *to_boundaries, *to_onsets])
-        grazes = jnp.stack([loops, loops, True, *[False] * (n + 2)])
+        grazes = jnp.stack([turns, turns, True, *[False] * (n + 2)])
         usable = (end != names.unused) & jnp.where(grazes, wanted >= 0, wanted <= 0)
         usable = usable & jnp.isfinite(found) & (found > farther)
         return jnp.where(usable, found, jnp.inf), grazes, held
@@ -357,8 +369,10 @@ def end_near_edge(
 
 
 def _without_excursion(osc: Oscillator, loop: Loop, near: EdgeEnd) -> tuple[Loop, Array]:
-    """The loop without what lies beyond the edge, if all of that is the extremum of x1 that ends a
-    row; and the row that then ends in that extremum."""
+    """The loop without its part beyond the edge, and the row that then ends in the extremum.
+
+    Only if all of that part is the extremum of x1 that ends a row.
+    """
     row = near.row
     n = len(osc.belts)
     names = Ends(n)

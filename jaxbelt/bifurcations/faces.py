@@ -1,10 +1,10 @@
 """The parts into which curves cut a plane of two parameters: each has one name.
 
 The cells of a map are coarse, its curves are exact. On a raster much finer than the cells the
-curves are walls, and a face is what can be reached without passing one. The cells that lie in a
-face tell its name; of one in which none lies, a point is asked that lies well inside of it. So
-every pixel has the name of its own side of every curve, however coarse the cells are. Where curves
-do not bound a face, the nearest cell in it tells.
+curves are walls, and a face is what can be reached without passing one. A face has the name of the
+cells in it; where no cell lies in it, a point well inside of it is computed. So every pixel has the
+name of its own side of every curve, however coarse the cells are. Where curves do not bound a face,
+the nearest cell in it decides.
 """
 
 from collections.abc import Sequence
@@ -14,23 +14,24 @@ import numpy as np
 
 #: Pixels along each side of the raster: a line of a picture is a few of them wide.
 PIXELS = 900
-#: Pixels beside a wall: a chord of a bent curve may be off by so many, so cells and faces this near
-#: to one tell nothing.
+#: Width of the strip along a wall, in pixels, whose cells and faces are ignored: a chord of a bent
+#: curve may be off by so much.
 LEFT_OUT = 3.0
 
-#: The first and the last value of each of the two parameters.
+#: First and last value of each of the two parameters.
 Span = tuple[tuple[float, float], tuple[float, float]]
 
 
 class Faces:
-    """The faces of a plane: span of the parameters, and the paths of the curves, [rows, 2] each.
+    """The faces of a plane.
 
-    number: of the face of each pixel, from 1, [PIXELS, PIXELS], the first parameter along the
-    rows; 0 on a curve. depth: how far it is from the nearest curve, in pixels.
+    span: of the parameters; paths: of the curves, [rows, 2] each. number: the face of each pixel,
+    from 1, [PIXELS, PIXELS], the first parameter along the rows; 0 on a curve. depth: distance from
+    the nearest curve, in pixels.
     """
 
     def __init__(self, span: Span, paths: Sequence[np.ndarray]):
-        # A quarter of a second that only maps need.
+        # The import takes a quarter of a second, which only maps need.
         from scipy.ndimage import distance_transform_edt, label
 
         self.low, self.high = np.array(span).T
@@ -54,8 +55,10 @@ class Faces:
         return int(row), int(column)
 
     def unnamed(self, points: np.ndarray) -> list[tuple[float, float]]:
-        """A point well inside each face in which none of the points lies, but for faces that are
-        hardly wider than a line."""
+        """A point well inside each face that contains none of the points.
+
+        Faces that are hardly wider than a line are left out.
+        """
         from scipy.ndimage import maximum, maximum_position
 
         known = np.zeros(self.count + 1, bool)
@@ -70,7 +73,7 @@ class Faces:
         return [(float(p), float(q)) for p, q in (self.low + np.array(at) * step for at in places)]
 
     def named(self, points: np.ndarray, names: Sequence[str]) -> np.ndarray:
-        """The name of each pixel, as points with names tell, [PIXELS, PIXELS]."""
+        """Name of each pixel, from points with names, [PIXELS, PIXELS]."""
         from scipy.ndimage import find_objects
 
         known = sorted(set(names))
@@ -92,8 +95,10 @@ class Faces:
 
 
 def densely(path: np.ndarray, apart: float) -> np.ndarray:
-    """A path with points no farther apart than that along either axis: with half a pixel no pixel
-    between two is left out."""
+    """A path with points at most this far apart along either axis.
+
+    With half a pixel no pixel between two points is left out.
+    """
     if len(path) < 2:
         return path
     gone = np.append(0.0, np.cumsum(np.max(np.abs(np.diff(path, axis=0)), axis=1)))
@@ -102,7 +107,7 @@ def densely(path: np.ndarray, apart: float) -> np.ndarray:
 
 
 def _filled(codes: np.ndarray) -> np.ndarray:
-    """Where a code is negative that of the nearest pixel with another one; 0 where none has."""
+    """Negative codes replaced by that of the nearest other pixel; 0 if there is none."""
     from scipy.ndimage import distance_transform_edt
 
     if not np.any(codes >= 0):

@@ -28,13 +28,13 @@ from .edge_rests import pseudo_hopf_limit
 from .rests import hopf_limit
 from .systems import CycleSystem, contact_tests, nearest_contacts, third_derivative
 
-#: Starts of which the first loops are compared. From 12 to 96 find the same folds of a smooth law,
-#: down to cycles of amplitude 0.03, in 11 to 32 ms.
+#: Number of starts whose first loops are compared. With 12 to 96 the same folds of a smooth law are
+#: found, down to cycles of amplitude 0.03, in 11 to 32 ms.
 STARTS = 48
 
 
 class UnitMultiplier(CycleSystem):
-    """A cycle with multiplier one; width: from its smallest to its largest x1, in the guess."""
+    """A cycle with multiplier one; width: range of x1 of the guess."""
 
     chain: Chain
     width: Array
@@ -59,8 +59,8 @@ class UnitMultiplier(CycleSystem):
         sticks = self.chain.used & jnp.any(self.chain.codes == 0, axis=-1)
         nearest, _ = nearest_contacts(osc, self.chain, z, sticks)
         tests = contact_tests("FoldGrazing", nearest, jnp.ones(nearest.shape, bool))
-        # Largest x1 less its mean. Beyond an equilibrium the equations go on, what is largest and
-        # smallest exchanged.
+        # Largest x1 less its mean. Beyond an equilibrium the equations go on with the largest and
+        # the smallest exchanged.
         size = z[0, 0] - jnp.mean(z[:, 0], where=self.chain.used)
         return tests, size > 0, jnp.where(jnp.any(sticks), 0.0, slope)
 
@@ -69,13 +69,13 @@ class FoldOfCycles(AbstractCycleCondition):
     """Two cycles that do not stick, a stable and an unstable one, meet and vanish.
 
     Near a degenerate Hopf point, where both shrink to the equilibrium, small ones are not found. In
-    the case of the tests, those with x1_max - x1_min above 0.006 are, from guesses some two times
-    as far from the point as that is from the Hopf point.
+    the tests' example cycles with x1_max - x1_min above 0.006 are found, from guesses about twice
+    as far from the point as the point is from the Hopf point.
     """
 
     caption: ClassVar[str] = "fold of cycles"
     line: ClassVar[Line] = Line("fold of cycles", "#E69F00")
-    #: Beyond a fold orbits pass the place of the cycles slowly, as if they were there.
+    #: Beyond a fold orbits pass the place of the cycles slowly, as if these existed.
     slow: ClassVar[bool] = True
     has_several: ClassVar[bool] = True
     ends_at_contact: ClassVar[bool] = True
@@ -95,8 +95,10 @@ class FoldOfCycles(AbstractCycleCondition):
         return [*(one.loop for one in cycles if one.path and not sticks(one.path)), None]
 
     def limit(self, trail):
-        """Where the cycle has shrunk to an equilibrium, at a degenerate Hopf or pseudo-Hopf
-        point."""
+        """The point where the cycle has shrunk to an equilibrium.
+
+        That is a degenerate Hopf or pseudo-Hopf point.
+        """
         if trail.end is Stop.POINT_COUNT:
             return None
         limit = hopf_limit("DegenerateHopf", trail, third_derivative)
@@ -105,13 +107,12 @@ class FoldOfCycles(AbstractCycleCondition):
 
 @jit
 def _extremal_loop(osc: Oscillator, rests: Equilibria, size: int):
-    """A loop that neither grows nor shrinks, nearly, nor do its neighbours; and a status.
+    """A loop that nearly closes, as do its neighbours; and a status.
 
-    So it is where two cycles meet. It is the first loop whose growth is extremal among its
-    neighbours'; of several the one that closes best. Near a fixed point with eigenvalues rate +- i
-    frequency the growth tends to 2 pi rate/frequency, and it has an extremum there that is no more
-    than an effect of where loops begin: it differs from that limit by a term of second order in the
-    rate.
+    Two cycles meet there. It is the first loop whose growth is extremal among its neighbours'; of
+    several the one that closes best. Near a fixed point with eigenvalues rate +- i frequency the
+    growth tends to 2 pi rate/frequency, and it has an extremum there that is only an effect of
+    where loops begin: it differs from that limit by a term of second order in the rate.
     """
     still, rests = lax.stop_gradient((osc, rests))
     eligible = (rests.kind != EquilibriumKind.SEGMENT) & (rests.kind > 0)
@@ -130,7 +131,7 @@ def _extremal_loop(osc: Oscillator, rests: Equilibria, size: int):
         distances = jnp.exp(jnp.linspace(jnp.log(bracket[0]), jnp.log(bracket[1]), STARTS))
         orbits, growth, sticks = each(loop)(distances)
         change = jnp.diff(growth)
-        # Its neighbours may stick; what is extremal lies beside them.
+        # Its neighbours may stick; the extremum lies beside them.
         extremal = (change[1:] * change[:-1] < 0) & ~sticks[1:-1]
         extremal = extremal & (jnp.abs(growth - limit) > 0.05 * jnp.abs(growth))[1:-1]
         at = 1 + jnp.argmin(jnp.where(extremal, jnp.abs(growth[1:-1]), jnp.inf))

@@ -52,7 +52,7 @@ from ..cycles.periodic import (
     periodic_from,
 )
 from ..cycles.shooting import jacobian
-from ..model.instants import course, guards_at
+from ..model.instants import guards_at, trend_of
 from ..model.modes import STUCK, capacity, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator, at_time, check_clock
 from ..model.own_units import OwnOscillator, in_own_units, rescaled
@@ -220,7 +220,7 @@ class AtLimit(TimedSystem):
         def guards(y):
             return guards_at(osc, mode, y)
 
-        limits = course(osc, mode, guards, (y[0], y[1], y[2])).slope[-2:]
+        limits = trend_of(osc, mode, guards, (y[0], y[1], y[2])).slope[-2:]
         values = guards((y[0], y[1], y[2]))[-2:]
         rises = -jnp.where(values[0] < values[1], limits[0], limits[1])
         other = (motion.status == Status.OK) & ~(self.rises * rises >= 0)
@@ -550,7 +550,7 @@ class _AtArrival(AbstractForcedCondition):
 def _excess(osc: Oscillator, codes: Array, y: Array) -> tuple[Array, Array]:
     """By how much the force that is needed exceeds what the stuck belts hold, and its rate."""
     mode = mode_of(codes)
-    at = course(osc, mode, lambda y: guards_at(osc, mode, y)[-2:], (y[0], y[1], y[2]))
+    at = trend_of(osc, mode, lambda y: guards_at(osc, mode, y)[-2:], (y[0], y[1], y[2]))
     nearest = jnp.argmin(at.value)
     return -at.value[nearest], -at.slope[nearest]
 

@@ -1,7 +1,7 @@
-"""Loops of cycles near which a condition is looked for.
+"""Loops of cycles as guesses for conditions.
 
-Orbits are followed from where stick phases end, and from a few places beside an equilibrium, until
-a loop repeats.
+Orbits are followed from ends of stick phases, and from a few places beside an equilibrium, until a
+loop repeats.
 """
 
 import functools
@@ -25,26 +25,26 @@ from ..results import Status
 from .systems import third_derivative, velocity_of
 
 #: Arcs for which the orbit from slip onset is followed in search of the signature. Of 665 such
-#: orbits (300 oscillators, half of them of round numbers) 84% had settled by then, 87% after 96.
+#: orbits (300 oscillators, half of them of round numbers) 84% repeated by then, 87% after 96.
 HINT_BUDGET = 32
-#: Arcs for which each orbit is followed that may lead to a cycle, and how often, from what it
-#: approaches, or on, until it has settled. Of the 1,565 orbits from `starts` of those oscillators
-#: 87% had settled within 96 arcs, 95% within 384 and 97% within 768; the others creep.
+#: Arcs for which each orbit is followed that may lead to a cycle, and how often it is followed on,
+#: or from its limit, until it repeats. Of the 1,565 orbits from `starts` of those oscillators 87%
+#: repeated within 96 arcs, 95% within 384 and 97% within 768; the others creep.
 FOLLOWED = 96
 ATTEMPTS = 6
-#: Where some of them start to the right of an equilibrium, so far from it; and where one more does
-#: if it repels: within an unstable cycle around it there may be one that attracts.
+#: Distances of starts to the right of an equilibrium. One more, INNERMOST, is used if the
+#: equilibrium repels: within an unstable cycle around it there may be one that attracts.
 DISTANCES, INNERMOST = (0.02, 0.3, 3.0), 4e-3
-#: How far beside a saddle some start: a cycle that attracts may pass it as closely, soon after a
+#: Distance of starts beside a saddle: a cycle that attracts may pass it as closely, soon after a
 #: connection.
 BESIDE_SADDLE = 1e-9
 
 
 def starts(osc: Oscillator, rests: Equilibria) -> Array:
-    """Where the orbits start that find the cycles, [starts, 2].
+    """Starts of the orbits that find the cycles, [starts, 2].
 
-    Where stick phases end, just beside the saddles, and at several distances from an equilibrium,
-    the farthest one last. NaN: no such start.
+    They lie at ends of stick phases, just beside the saddles, and at several distances from an
+    equilibrium, the farthest one last. NaN: no such start.
     """
     exists = rests.kind > 0
     repels = exists & ~rests.stable
@@ -62,7 +62,7 @@ def starts(osc: Oscillator, rests: Equilibria) -> Array:
 
 
 def _innermost(osc: Oscillator, rests: Equilibria, row: Array) -> Array:
-    """How far from an equilibrium that repels the innermost start is.
+    """Distance of the innermost start from an equilibrium that repels.
 
     Beside a supercritical Hopf point the cycle is there, to third order: its damping over a loop,
     rate A^2 + y A^4 / 16 with the third derivative y of x2' by x2, is zero. Orbits would hardly
@@ -76,14 +76,14 @@ def _innermost(osc: Oscillator, rests: Equilibria, row: Array) -> Array:
 
 
 def approach(osc: Oscillator, rests: Equilibria, start: Array, stride: float | Array) -> Orbit:
-    """The orbit from a start until it settles, with the status OK where that is on a cycle.
+    """Follows the orbit from a start until it repeats; the status is OK where it is on a cycle.
 
-    If it has not settled, it is followed on, from what it approaches where that can be told: the
-    differences of the last three tops form a geometric sequence, so its limit is known (Aitken). If
-    that is much nearer to the last top than this is to any equilibrium, the orbit from there is
-    followed next, for on the way there may be a boundary. What even then has not settled counts as
-    settled, its last loop as the one that repeats. Not where the mass sticks in that one: such an
-    orbit is followed on: from the end of the stick phase it repeats exactly.
+    An orbit that does not repeat is followed on, from its limit where that is known: if the
+    differences of the last three tops form a geometric sequence, Aitken's formula gives it. If the
+    limit is much nearer to the last top than that is to any equilibrium, the orbit from there is
+    followed next, as there may be a boundary on the way. If that does not repeat either, its last
+    loop counts as the one that repeats. An orbit whose last loop sticks is followed on instead:
+    from the end of the stick phase it repeats exactly.
     """
 
     def attempt(state):
@@ -124,7 +124,7 @@ def approach(osc: Oscillator, rests: Equilibria, start: Array, stride: float | A
 
 
 @jit
-def settled_loops(
+def repeated_loops(
     osc: Oscillator, rests: Equilibria, size: int, stride: float | Array = STRIDE
 ) -> tuple[Loop, Array]:
     """The loops that the orbits from `starts` repeat, in `size` arcs each, and their status."""
@@ -141,9 +141,9 @@ def settled_loops(
 
 
 def nearest(osc: Oscillator, size: int, condition: Any) -> tuple[Loop, Array]:
-    """Of the attracting cycles, in `size` arcs, the one with the least condition.distance(osc,
-    loop), and a status."""
-    return _least_distant(osc, *settled_loops(osc, candidates(osc), size), condition)
+    """The attracting cycle, in `size` arcs, with the least condition.distance(osc, loop), and a
+    status."""
+    return _least_distant(osc, *repeated_loops(osc, candidates(osc), size), condition)
 
 
 @jit
@@ -160,7 +160,8 @@ def _least_distant(osc: Oscillator, loops: Loop, status: Array, condition: Any):
 def least_push(osc: Oscillator, loop: Loop, belt: int | Array) -> tuple[Array, Array]:
     """The arc that arrives to stick to a belt with the least x2': its row, and the size of that.
 
-    From the side on which that vanishes where the orbit is tangent to the boundary; inf: none.
+    From the side on which x2' vanishes where the orbit is tangent to the boundary; inf: there is
+    none.
     """
     side = jnp.sign(velocity_of(osc, belt))
     arrives = loop.used & (following_codes(loop)[:, belt] == 0) & (loop.codes[:, belt] == side)
@@ -174,11 +175,11 @@ def least_push(osc: Oscillator, loop: Loop, belt: int | Array) -> tuple[Array, A
 
 @jit
 def orbit_after_stick(osc: Oscillator, belt: int | Array) -> tuple[Oscillator, Array, Orbit]:
-    """The orbit from where a stick phase on a belt ends, its start, the oscillator.
+    """The orbit from the end of a stick phase on a belt, its start, and the oscillator.
 
-    Of several the one that comes back most nearly tangent to its boundary to stick there; if none
-    does, the one that comes nearest to it. The oscillator is the one given but for the velocity of
-    that belt: where it is at rest, no orbit leaves.
+    Of several orbits the one that comes back most nearly tangent to its boundary to stick there; if
+    none does, the one that comes nearest to it. The oscillator is the given one except for the
+    velocity of that belt: if it is at rest, no orbit leaves, and it gets a small velocity.
     """
     velocities = [
         jnp.where((belt == i) & (one.velocity == 0), 1e-2, one.velocity)
@@ -226,7 +227,7 @@ def repeated_loop(orbit: Orbit, size: int, n: int) -> tuple[Loop, Array]:
 
 
 def without_arcs(loop: Loop, row: Array, removed: Array) -> tuple[Loop, Array]:
-    """The loop without so many arcs after a row; and that row, which is its last one then."""
+    """The loop without `removed` arcs after a row; and that row, which is then its last one."""
     rows, count = jnp.arange(loop.ends.size), jnp.maximum(jnp.sum(loop.used), 1)
     left, first = count - removed, row + removed + 1
     source = jnp.where(rows < left, first + rows, first) % count

@@ -1,8 +1,8 @@
 """Cycles that come from infinity: `HopfAtInfinity`.
 
-Where loops far out neither grow nor shrink, see `model.far_out`, a cycle goes to infinity: the
-bound between what grows beyond all bounds and what does not. On the side of less damping it exists,
-and repels.
+Where loops far out neither grow nor shrink, see `model.far_out`, a cycle goes to infinity: it
+separates motions that grow beyond all bounds from those that do not. It exists on the side of less
+damping, and repels.
 
 Such points are known as Hopf bifurcations at infinity: J. N. Glover, Hopf bifurcations at infinity,
 Nonlinear Analysis 13 (1989) 1393-1398.
@@ -37,9 +37,10 @@ class FarOut(RestSystem):
 
 
 class HopfAtInfinity(AbstractRestCondition):
-    """A cycle that repels, around all else, comes from infinity: where damping is zero, mostly.
+    """An unstable cycle around everything else comes from infinity, mostly where the damping is
+    zero.
 
-    Beyond, with less damping, what starts outside of it grows beyond all bounds.
+    Beyond, with less damping, motions from outside of it grow beyond all bounds.
     """
 
     caption: ClassVar[str] = "Hopf at infinity"

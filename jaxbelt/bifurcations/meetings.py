@@ -1,17 +1,17 @@
 """Contact edges of two belts that meet: `EdgeExchange` and `MeetingEdges`.
 
-Beside such a point the two edges lie close together, and between them the contacts are others than
-to the left and to the right of both. At the point there is nothing between; beyond, the edges come
-in the other order, and the contacts between them are others again.
+Beside such a point the two edges lie close together, and the contacts between them differ from
+those to the left and to the right of both. At the point there is nothing between; beyond, the edges
+come in the other order, and the contacts between them are different again.
 
 - `EdgeExchange`: a cycle passes both edges, one right after the other. Its velocity is not zero
   there, so the arc between them has the duration distance/velocity. It vanishes at the point like
   the distance itself, and with the signature fixed the cycle goes smoothly through, as at a sliding
-  exchange. The orbit changes continuously; its modes, and the order of its events, at once.
+  exchange. The orbit changes continuously; its modes, and the order of its events, change at once.
 - `MeetingEdges`: the mass can rest there, whether a cycle passes or not. By the accelerations at
   rest to the left of both edges, between them and to the right of both, there is a pseudo-focus on
-  one of the edges, a segment between them, or nothing. Beyond, that between them is another one:
-  what rests there may come to the other edge, change its stability, begin or cease to be.
+  one of the edges, a segment between them, or nothing. Beyond, the acceleration between them is
+  another one: the equilibrium may move to the other edge, change its stability, appear or vanish.
 """
 
 from itertools import pairwise, product
@@ -39,13 +39,13 @@ from .systems import CycleSystem, RestSystem
 
 
 class TwoEdges(eqx.Module):
-    """Two edges by their numbers in `modes.edges`, the first one of the first belt."""
+    """Two edges by their numbers in `modes.edges`; the first one belongs to the first belt."""
 
     first: Array
     second: Array
 
     def gap(self, osc: Oscillator) -> Array:
-        """How far the first one is to the right of the second one."""
+        """Distance of the first one to the right of the second one."""
         positions = jnp.stack(edges(osc))
         return positions[self.first] - positions[self.second]
 
@@ -65,19 +65,19 @@ class _BetweenEdges(AbstractCondition):
 
 
 def _edge_pairs(osc: Oscillator, belts: tuple[int | Array, int | Array]) -> TwoEdges:
-    """The four pairs of an edge of one belt and one of the other one, [4]."""
+    """The four pairs of an edge of one belt and one of the other, [4]."""
     n = len(osc.belts)
     pairs = [(belts[0] + i * n, belts[1] + j * n) for i, j in product((0, 1), repeat=2)]
     return TwoEdges(*(jnp.stack([jnp.asarray(one) for one in ends]) for ends in zip(*pairs)))
 
 
 def _size(gap: Array) -> Array:
-    """The size of a gap between edges, inf where one of them is infinite, or both are."""
+    """Size of a gap between edges, inf where one of them is infinite, or both are."""
     return jnp.where(jnp.isfinite(gap), jnp.abs(gap), jnp.inf)
 
 
 def _both_rub(osc: Oscillator, belts: tuple[int | Array, int | Array]) -> Array:
-    """Whether both belts have a load: the edge of one without does nothing."""
+    """Whether both belts have a load: the edge of a belt without load does nothing."""
     loads = jnp.stack([belt.load for belt in osc.belts])
     return (loads[belts[0]] > 0) & (loads[belts[1]] > 0)
 
@@ -86,8 +86,7 @@ def _both_rub(osc: Oscillator, belts: tuple[int | Array, int | Array]) -> Array:
 
 
 class EdgesPassed(CycleSystem):
-    """A cycle that passes two edges, one right after the other, at the end of `row` and of the arc
-    that follows."""
+    """A cycle that passes two edges in succession, at the ends of `row` and of the arc after it."""
 
     chain: Chain
     row: Array
@@ -104,6 +103,9 @@ class EdgeExchange(AbstractCycleCondition, _BetweenEdges):
     """Contact edges of two belts meet and change places where a cycle passes them.
 
     Beyond, it passes them in the other order; between them it slips, or sticks, otherwise.
+
+    Args:
+        belts: Numbers of the two belts.
     """
 
     caption: ClassVar[str] = "edge exchange, belts {belt}"
@@ -111,13 +113,13 @@ class EdgeExchange(AbstractCycleCondition, _BetweenEdges):
 
     @property
     def room(self):
-        return SIZES[1]  # passing edges takes more of them
+        return SIZES[1]  # passing edges needs more arcs
 
     def guess(self, osc, size):
         return nearest(osc, size, self)
 
     def distance(self, osc: Oscillator, loop: Loop) -> Array:
-        """How far apart the edges are that the loop passes."""
+        """Distance between the edges that the loop passes."""
         return _passage(osc, loop, self.belts)[0]
 
     def system(self, osc, loop, status):
@@ -133,9 +135,11 @@ class EdgeExchange(AbstractCycleCondition, _BetweenEdges):
 
 
 def _passage(osc: Oscillator, loop: Loop, belts) -> tuple[Array, Array, TwoEdges]:
-    """Of the places where a loop passes an edge of each of the belts, one right after the other,
-    that at which these are nearest: how far apart they are, inf if there is none; the row that ends
-    on the first one; the edges."""
+    """The place where a loop passes an edge of each belt in succession and these are nearest.
+
+    Returns the distance of the edges, inf if there is no such place, the row that ends on the first
+    one, and the edges.
+    """
     n, positions, pairs = len(osc.belts), jnp.stack(edges(osc)), _edge_pairs(osc, belts)
     passes = (loop.ends >= n) & (loop.ends < 3 * n)
     last = jnp.arange(loop.ends.size) == jnp.sum(loop.used) - 1
@@ -144,7 +148,7 @@ def _passage(osc: Oscillator, loop: Loop, belts) -> tuple[Array, Array, TwoEdges
 
     def distances(pair):
         first, second = positions[pair.first], positions[pair.second]
-        # Where they are in one place both are passed at once.
+        # Where they are at one place both are passed at once.
         then = jnp.where(first == second, at, following)
         passed = (at == first) & (then == second) | (at == second) & (then == first)
         return jnp.where(passed, _size(pair.gap(osc)), jnp.inf)
@@ -158,7 +162,7 @@ def _passage(osc: Oscillator, loop: Loop, belts) -> tuple[Array, Array, TwoEdges
 
 
 class EdgesAtRest(RestSystem):
-    """Two edges meet, and nothing else is unknown; belts: those whose edges they are."""
+    """Two edges meet, and nothing else is unknown; belts: those with these edges."""
 
     pair: TwoEdges
     belts: tuple[int | Array, int | Array]
@@ -174,7 +178,7 @@ class EdgesAtRest(RestSystem):
         return jnp.stack(edges(osc))[self.pair.first]
 
     def exists(self, osc, x):
-        """Whether there is something at rest on, or between, them in either order."""
+        """Whether the mass can rest on, or between, them in either order."""
         positions = jnp.stack(edges(osc))
         ends = jnp.sort(jnp.stack([positions[self.pair.first], positions[self.pair.second]]))
         rest = jnp.zeros(())
@@ -182,7 +186,8 @@ class EdgesAtRest(RestSystem):
         right = contact(osc, ends[1], rest, rightward=True)
         found = []
         for passed in self.belts:
-            # Between them the belt whose edge comes first is in contact as to the right of both.
+            # Between them the belt whose edge comes first has the contact that it has to the right
+            # of both.
             codes = [
                 jnp.where(passed == number, after, before)
                 for number, (before, after) in enumerate(zip(left.codes, right.codes, strict=True))
@@ -194,7 +199,7 @@ class EdgesAtRest(RestSystem):
 
 
 def _push(osc: Oscillator, mode: Mode, x1: Array) -> Array:
-    """Where to the mass is pushed at rest: the sign of x2', 0 where belts at rest hold it."""
+    """Direction of the force at rest: the sign of x2', 0 where belts at rest hold the mass."""
     needed = mode_acceleration(osc, mode, x1, jnp.zeros(()))
     held = mode.any_stuck & (jnp.abs(needed) <= capacity(osc, mode))
     return jnp.where(held, 0.0, jnp.sign(needed))
@@ -203,7 +208,10 @@ def _push(osc: Oscillator, mode: Mode, x1: Array) -> Array:
 class MeetingEdges(AbstractRestCondition, _BetweenEdges):
     """Contact edges of two belts meet and change places where the mass can rest.
 
-    What rests there is another one beyond, or of another stability, or begins or ceases to be.
+    Beyond, the equilibrium there has another kind or stability, or it appears or vanishes.
+
+    Args:
+        belts: Numbers of the two belts.
     """
 
     caption: ClassVar[str] = "edges meet, belts {belt}"

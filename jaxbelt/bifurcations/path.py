@@ -1,17 +1,18 @@
-"""A path in one parameter, and what the oscillator does along it: `ParameterPath`.
+"""A path in one parameter, and the motions of the oscillator along it: `ParameterPath`.
 
-What the oscillator does at one value of the parameter is summed up in a label: the kind and the
-stability of every equilibrium, and the itinerary of every attracting cycle, that is, the modes that
-it passes in one loop, see `attractors`. A cycle that sticks comes by a place where a stick phase
-ends, in slip onset or on a contact edge, so it is found by following the orbits from there; a few
-starts beside the equilibria find the rest. Values are looked at in batches by one compiled program.
+A label sums up the motions at one value of the parameter: the kind and the stability of every
+equilibrium, and the itinerary of every attracting cycle, that is, the modes that it passes in one
+loop, see `attractors`. A cycle that sticks passes a place where a stick phase ends, in slip onset
+or on a contact edge, so it is found by following the orbits from there; a few starts beside the
+equilibria find the other cycles. One compiled program computes labels in batches.
 
 Where contact edges have saddles a label also has the courses of the orbits that leave them, see
 `connections`.
 
-Between two values with one label nothing is taken to happen, if each cycle at one of them goes on
-to one at the other. One that sticks does so if they have one itinerary. Of those that do not stick
-several may have it: each is followed to where its derivative by the parameter leads.
+Between two values with one label nothing is assumed to happen if each cycle at one of them
+continues to one at the other. A cycle that sticks does so if both have one itinerary. Several
+cycles that do not stick may have the same one: each is followed to where its derivative by the
+parameter leads.
 """
 
 import functools
@@ -27,10 +28,11 @@ from jaxtyping import ArrayLike
 
 from ..checks import is_concrete, require
 from ..cycles.attractors import (
+    GOES_ON,
     LEAST_MOMENT,
-    SOLVED,
+    SAME_CYCLE,
     Itinerary,
-    apart,
+    distance,
     itinerary,
     place_of,
     sticks,
@@ -51,23 +53,21 @@ from ..numerics.compiling import each, jit
 from ..results import Status
 from .base import AbstractCondition, check_conditions
 from .connections import SaddleCourse, courses_of
-from .guesses import settled_loops
+from .guesses import repeated_loops
 from .labels import AttractingCycle, Label
 
 #: Values of the parameter in one batch.
 BATCH = 32
 #: Room for the arcs of one loop.
 ROOM = SIZES[1]
-#: Nothing closer than this, and this fraction of the span, is told apart.
+#: Values closer than CLOSE * (unit + span) count as equal.
 CLOSE = 1e-6
-#: The fraction of a step along the path by which the derivative of a cycle is taken; but no less
-#: than CLOSE: one that hardly attracts is known to 1e-5 of its size only.
+#: Fraction of a step along the path by which the derivative of a cycle is taken, but no less than
+#: CLOSE: a cycle that hardly attracts is known to 1e-5 of its size only.
 DIFFERENCE = 1e-3
-#: A cycle is where it is expected if it is no further from there, relative to its size, or than
-#: a third of the way that it is expected to go. Nearer to a square root, intervals get smaller.
+#: A cycle is at its expected place if it is no farther from there than this, relative to its size,
+#: or than a third of its expected move. Closer to a square root, intervals get smaller.
 EXPECTED = 1e-3
-#: An unstable cycle goes on to one at the next value that is no farther off, relative to its size.
-BESIDE_ONE_ANOTHER = 0.3
 
 
 class ParameterPath:
@@ -76,7 +76,7 @@ class ParameterPath:
     def __init__(
         self, osc, where, span, conditions: Sequence[AbstractCondition] = (), *, basins: bool = True
     ):
-        #: Whether labels tell what changes basins only, and nothing that attracts.
+        #: Whether labels contain courses, which change basins only and nothing that attracts.
         self.basins = basins
         # `where` first: where it is left out, the span stands in its place.
         if isinstance(osc, Oscillator):
@@ -89,11 +89,11 @@ class ParameterPath:
         conditions = check_conditions(conditions)
         for value in (first, last):
             given.check(value)
-        #: The one that was given, or that at the first value.
+        #: The given oscillator, or the one at the first value.
         self.osc = osc if isinstance(osc, Oscillator) else at_first
         for condition in conditions:
             condition.check(self.osc)
-        #: In own units, the parameter too, as all that follows.
+        #: In own units, the parameter too, like everything that follows.
         ends = np.array([[0.5 * (first + last)], [first], [last]])
         self.variation = given.in_own_units(*ends)
         self._oscillators: dict[float, Oscillator] = {}
@@ -101,15 +101,17 @@ class ParameterPath:
         self.first, self.last = first / measured, last / measured
         self.conditions = conditions
         self.length = self.last - self.first
-        #: In which the parameter is measured.
+        #: Unit of the parameter.
         self.unit = float(self.variation.family(np.array([0.5 * (self.first + self.last)])).unit)
         (self.name,) = self.variation.names
         self.labels: dict[float, Label] = {}
         self.cycles: dict[float, list[AttractingCycle]] = {}
         self.unstable_cycles: dict[tuple[float, int], Cycle] = {}
+        #: How often Newton's method was begun for a point of it.
+        self.attempts = 0
         self._searched: set[tuple[float, int]] = set()
-        # From which value to which other one, from which cycle to which, of those that do not
-        # stick; None where there is none.
+        # From one value to another: for each cycle that does not stick the one that it continues
+        # to, or None.
         self._goes_on: dict[tuple[float, float], dict[int, int | None]] = {}
         # Whether there is one at a value.
         self._pseudo_foci: dict[float, bool] = {}
@@ -120,28 +122,34 @@ class ParameterPath:
         self.breaks = sorted(self._coincidences.keys() | self._meetings.keys())
 
     def inside(self, end: float) -> float:
-        """An end of the span; or where a load vanishes there a value beside it: labels name no belt
-        without load, but as the load vanishes nothing happens."""
+        """An end of the span, or a value beside it where a load vanishes at the end.
+
+        Labels name no belt without load, but nothing happens as the load vanishes.
+        """
         middle = 0.5 * (self.first + self.last)
         here, there = ([float(b.load) for b in self.at(at).belts] for at in (end, middle))
         vanishes = any(a == 0 and b != 0 for a, b in zip(here, there, strict=True))
         return end + CLOSE * (middle - end) if vanishes else end
 
     def at(self, value: float) -> Oscillator:
-        """The oscillator there, made once."""
+        """The oscillator at a value, made once."""
         if value not in self._oscillators:
             self._oscillators[value] = self.variation.oscillator(np.array([value]))
         return self._oscillators[value]
 
     def unstable(self, value: float, around: int) -> Cycle:
-        """The unstable cycle there around an equilibrium, or why there is none; computed once."""
+        """The unstable cycle at a value around an equilibrium, or why there is none; computed
+        once."""
         if (value, around) not in self.unstable_cycles:
             self.unstable_cycles[value, around] = from_starts(self.at(value), around=around)
         return self.unstable_cycles[value, around]
 
     def unstable_along(self, values: Sequence[float] | np.ndarray, around: int) -> list[Cycle]:
-        """The same at values in order; where starts near the equilibrium do not lead to one, or
-        pass over it to one farther out, what those at the values beside go on to."""
+        """Unstable cycles at values in order.
+
+        Starts near the equilibrium may lead to none, or pass over it to one farther out; there the
+        cycles at neighbouring values are continued.
+        """
         order = [float(value) for value in values]
         known = self.unstable_cycles
         if not any(_is_found(self.unstable(value, around)) for value in order):
@@ -159,8 +167,8 @@ class ParameterPath:
         return [known[value, around] for value in order]
 
     def beside(self, value: float, *, slow: bool = False) -> tuple[float, float]:
-        """The values just below and just above; farther off where motions are slow to settle."""
-        # Not nearer in a short span: a loop counts as repeated when it does so to 1e-7.
+        """The values just below and just above; farther off where motions converge slowly."""
+        # Not closer in a short span: a loop counts as repeated when it repeats to 1e-7.
         distance = CLOSE * (self.unit + self.length)
         far = value - 30.0 * distance, value + 30.0 * distance
         if slow:
@@ -178,9 +186,10 @@ class ParameterPath:
 
     @functools.cached_property
     def edged(self) -> list[int]:
-        """Belts with a finite contact edge, but for those without load, at whose edges nothing
-        happens; one for each place if they share their edges, that of one's own conditions if it is
-        among them."""
+        """Belts with a finite contact edge and a load, one for each set of shared edges.
+
+        Of belts that share their edges the one in a user's condition is taken, if there is one.
+        """
         own_first = [belt for one in self.conditions for belt in one.belts_concerned]
         belts: list[int] = []
         known: set[float] = set()
@@ -198,30 +207,29 @@ class ParameterPath:
         return belts
 
     def coinciding(self, value: float) -> list[tuple[int, ...]]:
-        """The pairs of belts that come to run at one velocity there, and those that come to rest
-        alone."""
+        """Pairs of belts that come to one velocity at a value, and single belts that come to
+        rest."""
         return self._coincidences.get(value, [])
 
     def meeting(self, value: float) -> list[tuple[int, ...]]:
-        """The pairs of belts of which contact edges meet there."""
+        """Pairs of belts with contact edges that meet at a value."""
         return self._meetings.get(value, [])
 
-    def look(self, values: Sequence[float] | np.ndarray) -> None:
-        """Find the labels there, in batches."""
+    def find_labels(self, values: Sequence[float] | np.ndarray) -> None:
+        """Computes the labels at these values, in batches."""
         new = sorted({float(v) for v in values} - self.labels.keys())
         for stride in (STRIDE, FINE_STRIDE):
             own = np.array([v for v in new if self._is_fine(v) == (stride == FINE_STRIDE)])
             for batch in (own[i : i + BATCH] for i in range(0, own.size, BATCH)):
-                self._look_at(batch, stride)
+                self._label_batch(batch, stride)
         self._agree_on_moments()
         self._share()
 
-    def look_finely(self, value: float, away: float) -> None:
-        """Find all labels no farther away from a value anew, by orbits that are good to 1e-12, as
-        they are found there from then on.
+    def find_labels_finely(self, value: float, away: float) -> None:
+        """Computes all labels within `away` of a value again, by orbits that are accurate to 1e-12.
 
-        Where two events of a cycle come close together the error of the others, some 1e-8, decides
-        which is first.
+        Later labels there are computed in the same way. Where two events of a cycle come close
+        together the error of other orbits, some 1e-8, decides which is first.
         """
         self._fine.append((value - away, value + away))
         again = [v for v in self.labels if abs(v - value) <= away]
@@ -229,7 +237,7 @@ class ParameterPath:
             del self.labels[v], self.cycles[v]
         known = self._goes_on.items()
         self._goes_on = {pair: to for pair, to in known if not set(pair) & set(again)}
-        self.look(again)
+        self.find_labels(again)
 
     def _is_fine(self, value: float) -> bool:
         return any(low <= value <= high for low, high in self._fine)
@@ -238,7 +246,7 @@ class ParameterPath:
         """Whether labels are found by fine orbits at two values."""
         return self._is_fine(a) and self._is_fine(b)
 
-    def _look_at(self, batch: np.ndarray, stride: float) -> None:
+    def _label_batch(self, batch: np.ndarray, stride: float) -> None:
         filled = np.concatenate([batch, np.full(BATCH - batch.size, np.nan)])
         oscs = self.variation.oscillators(filled[:, None])
         seen = jax.tree.map(np.asarray, _motions(oscs, np.asarray(stride)))
@@ -246,20 +254,20 @@ class ParameterPath:
         for lane, value in enumerate(batch.tolist()):
             self._take(value, jax.tree.map(lambda x, i=lane: x[i], seen), courses[lane])
 
-    def changes(self, settled: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-        """The intervals between values looked at that differ, but for those that are settled."""
+    def changes(self, explained: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+        """Intervals between labelled values that differ, without those that are explained."""
         return [
             (a, b)
             for a, b in pairwise(sorted(self.labels))
-            if not any(low <= a and b <= high for low, high in settled)
+            if not any(low <= a and b <= high for low, high in explained)
             and not (self.labels[a].is_as(self.labels[b]) and self._all_go_on(a, b))
         ]
 
     def _take(self, value: float, seen: "_Motions", courses: tuple[SaddleCourse, ...]) -> None:
-        """Label a value by what was seen there."""
+        """Labels a value by what was seen there."""
         exists = seen.kind > 0
         codes = without_idle(self.at(value), seen.modes[exists])
-        # Which way the belts rub at a pseudo-focus makes no difference to what it is.
+        # The direction in which belts rub at a pseudo-focus makes no difference.
         is_focus = seen.kind[exists, None] == EquilibriumKind.PSEUDO_FOCUS
         codes = np.where(is_focus & (codes == -1), 1, codes)
         columns = (seen.kind, seen.stable, seen.x1_lower, seen.x1_upper)
@@ -268,13 +276,14 @@ class ParameterPath:
         found: list[AttractingCycle] = []
         loops = [jax.tree.map(lambda x, i=i: x[i], seen.loop) for i in range(len(seen.status))]
         for loop, status in zip(loops, seen.status.tolist(), strict=True):
-            one = self._settled(value, loop) if status == Status.OK else None
+            one = self._attracting_cycle(value, loop) if status == Status.OK else None
             if one is not None and _number_among(one, found) is None:
                 found.append(one)
         if not found and not any(stable for _, stable, _ in rests):
-            # Nothing holds the orbits but a cycle that they approach slowly.
+            # The orbits are confined, so there is a cycle that they approach slowly.
             found.append(
-                self._settled(value, loops[-1], closes=False) or AttractingCycle((), loops[-1])
+                self._attracting_cycle(value, loops[-1], closes=False)
+                or AttractingCycle((), loops[-1])
             )
         self.cycles[value] = found
         self._name(value, rests, courses)
@@ -287,8 +296,10 @@ class ParameterPath:
         paths = tuple(one.path for one in cycles)
         self.labels[value] = Label(rests, paths, marks, courses, bounded)
 
-    def _settled(self, value: float, loop: Loop, *, closes: bool = True) -> AttractingCycle | None:
-        """The attracting cycle that a loop is nearly one of, or else leads to, or None.
+    def _attracting_cycle(
+        self, value: float, loop: Loop, *, closes: bool = True
+    ) -> AttractingCycle | None:
+        """The attracting cycle near a loop, or the one that it leads to, or None.
 
         A loop that sticks is one of it. Any other may only seem to repeat. closes: whether it is
         known to be one loop.
@@ -307,9 +318,10 @@ class ParameterPath:
         return None
 
     def _agree_on_moments(self) -> None:
-        """Let an arc of a cycle that takes hardly any time count where it does at the value beside.
+        """Makes neighbouring labels agree on arcs that take hardly any time.
 
-        It vanishes at a point that may be some way off, not where it comes to take a `MOMENT`.
+        Such an arc counts where it does at the value beside. It vanishes at a point that may be
+        some way off, not where its duration falls below `MOMENT`.
         """
         values = sorted(self.labels)
         for pairs in (pairwise(values), pairwise(values[::-1])):
@@ -324,9 +336,9 @@ class ParameterPath:
                             self._name(b, self.labels[b].equilibria, self.labels[b].courses)
 
     def _share(self) -> None:
-        """Let values know cycles that attract at the ones beside them.
+        """Adds attracting cycles that a neighbouring value has.
 
-        A cycle that sticks is always reached, from where that ends. One that does not may be
+        A cycle that sticks is always reached, from the end of its stick phase. Another cycle may be
         missed.
         """
         values = sorted(self.labels)
@@ -339,7 +351,8 @@ class ParameterPath:
                         known[i] = self._followed(a, b, i)
 
     def _all_go_on(self, a: float, b: float) -> bool:
-        """Whether the cycles at one value that do not stick go on to those at another, one each."""
+        """Whether the cycles at one value that do not stick continue to those at another, one to
+        one."""
         ahead = self._goes_on[a, b] | {
             i: j for j, i in self._goes_on[b, a].items() if i is not None
         }
@@ -348,38 +361,39 @@ class ParameterPath:
         return len(set(reached)) == len(smooth) and all(ahead.get(i) is not None for i in smooth)
 
     def _followed(self, known: float, value: float, number: int) -> int | None:
-        """The number of the cycle at one value to which one at another value goes on, or None.
+        """Number of the cycle at one value to which one at another value continues, or None.
 
-        It is looked for where that is expected to be, by its derivative.
+        It is searched at the expected place, from the derivative.
         """
         path, loop = self.cycles[known][number]
         step = value - known
         part = max(DIFFERENCE, CLOSE * (self.unit + self.length) / abs(step))
-        nearby = self._settled(known + part * step, loop)
+        nearby = self._attracting_cycle(known + part * step, loop)
         expected = loop
         if nearby is not None and nearby.path == path and _fits(nearby.loop, loop):
             parts = ((t.entries, t.durations) for t in (loop, nearby.loop))
             moved = [a + (b - a) / part for a, b in zip(*parts, strict=True)]
             expected = eqx.tree_at(lambda t: (t.entries, t.durations), loop, tuple(moved))
-        found = self._settled(value, expected)
+        found = self._attracting_cycle(value, expected)
         if found is None or found.path != path:
             return None
         places = [place_of(one) for one in (loop, expected, found.loop)]
-        if apart(places[1], places[2]) > EXPECTED * (1 + 300 * apart(places[0], places[1])):
+        way = distance(places[0], places[1])
+        if distance(places[1], places[2]) > EXPECTED * (1 + 300 * way):
             return None
         at = _number_among(found, self.cycles[value])
         if at is None:
             others = self.cycles[value]
-            # In place of one that was only taken to be there.
+            # Replaces a cycle that was only assumed.
             at = 0 if others and not others[0].path else len(others)
             others[at : at + 1] = [found]
             self._name(value, self.labels[value].equilibria, self.labels[value].courses)
         return at
 
-    def followed(self, values: Sequence[float]) -> list[dict[float, Loop]]:
+    def strands(self, values: Sequence[float]) -> list[dict[float, Loop]]:
         """The attracting cycles at these values, in order, in which nothing else happens.
 
-        Of each that goes on from value to value its loops, by the value.
+        For each cycle that continues from value to value its loops, by the value.
         """
         strands: list[dict[float, Loop]] = []
         sticking: dict[Itinerary, dict[float, Loop]] = {}
@@ -401,7 +415,7 @@ class ParameterPath:
         return [strand for strand in strands if strand]
 
     def _origin(self, before: float | None, value: float, number: int) -> int | None:
-        """The number of the cycle at the value before that goes on to one that does not stick."""
+        """Number of the cycle at the value before that continues to one that does not stick."""
         if before is None:
             return None
         back = self._goes_on[value, before].get(number)
@@ -409,15 +423,15 @@ class ParameterPath:
         return back if back is not None else next((i for i, j in ahead if j == number), None)
 
     def label(self, value: float) -> Label:
-        """The label there, which `look` has found."""
+        """The label at a value, which `find_labels` has computed."""
         return self.labels[float(value)]
 
 
 def _joined_rests(rows: Iterable[tuple]) -> tuple[tuple, ...]:
-    """(kind, stable, codes) of every equilibrium, from left to right; a segment, which `equilibria`
-    gives in pieces, is one past the edge of a belt without load.
+    """(kind, stable, codes) of every equilibrium, from left to right.
 
-    rows: (kind, stable, x1_lower, x1_upper, codes) of each.
+    rows: (kind, stable, x1_lower, x1_upper, codes) of each. A segment in pieces, divided by the
+    edge of a belt without load, becomes one.
     """
     rests: list[tuple] = []
     end = np.nan  # of the last one, if that is a segment
@@ -434,7 +448,7 @@ def _is_found(cycle: Cycle) -> bool:
 
 
 def _gone_on(osc: Oscillator, beside: Cycle) -> Cycle | None:
-    """What an unstable cycle at a value beside goes on to."""
+    """The cycle that an unstable cycle at a neighbouring value continues to."""
     loop = jax.tree.map(np.asarray, as_loop(beside, ROOM))
     cycle = polish(osc, cut([loop])[0], jnp.asarray(Status.OK.value))
     return cycle if _is_beside(beside, cycle) and float(cycle.multiplier) > 1 else None
@@ -442,7 +456,7 @@ def _gone_on(osc: Oscillator, beside: Cycle) -> Cycle | None:
 
 def _is_beside(cycle: Cycle, other: Cycle) -> bool:
     """Whether another cycle is found, and so near that one goes on to the other."""
-    return _is_found(other) and apart(place_of(cycle), place_of(other)) < BESIDE_ONE_ANOTHER
+    return _is_found(other) and distance(place_of(cycle), place_of(other)) < GOES_ON
 
 
 def _width(cycle: Cycle) -> float:
@@ -450,7 +464,7 @@ def _width(cycle: Cycle) -> float:
 
 
 def _is_off_rest(cycle: Cycle) -> bool:
-    """Whether a cycle is no equilibrium, to which it may shrink.
+    """Whether a cycle is not an equilibrium, to which it may shrink.
 
     Around a pseudo-focus its width is like its velocity squared: the larger of them is its size.
     """
@@ -458,18 +472,18 @@ def _is_off_rest(cycle: Cycle) -> bool:
 
 
 def _number_among(cycle: AttractingCycle, among: Sequence[AttractingCycle]) -> int | None:
-    """The number of a cycle among others, or None.
+    """Number of a cycle among others, or None.
 
     Two at the same place are one, whatever their modes: just before a corner that a cycle passes
     with a short stick phase, a loop without it solves the equations to their accuracy, too.
     """
     place = place_of(cycle.loop)
     for number, other in enumerate(among):
-        if not other.path:  # only taken to be there
+        if not other.path:  # only assumed
             continue
         if other.path == cycle.path and sticks(cycle.path):
             return number
-        if apart(place, place_of(other.loop)) < SOLVED:
+        if distance(place, place_of(other.loop)) < SAME_CYCLE:
             return number
     return None
 
@@ -480,7 +494,7 @@ def _fits(loop: Loop, other: Loop) -> bool:
 
 
 class _Motions(NamedTuple):
-    """Equilibria, [rows], and of every orbit its status and last loop, [starts, ROOM]."""
+    """Equilibria, [rows], and for every orbit its status and last loop, [starts, ROOM]."""
 
     kind: Any
     stable: Any
@@ -495,7 +509,7 @@ class _Motions(NamedTuple):
 def _motions(oscs: Oscillator, stride: ArrayLike) -> _Motions:
     def at(osc: Oscillator) -> _Motions:
         rests = candidates(osc)
-        loop, status = settled_loops(osc, rests, ROOM, stride)
+        loop, status = repeated_loops(osc, rests, ROOM, stride)
         known = (rests.kind, rests.stable, rests.modes, rests.x1_lower, rests.x1_upper)
         return _Motions(*known, status, loop)
 

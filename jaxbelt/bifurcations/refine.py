@@ -1,7 +1,7 @@
 """Bifurcation points near a guess: `refine`.
 
-By Newton's method from the guess. Where that fails, or ends far away, the point is bracketed: what
-`scan` does is done on small intervals around the guess, from short to long.
+By Newton's method from the guess. If that fails, or ends far away, the point is bracketed: the
+search of `scan` is done on small intervals around the guess, from short to long.
 """
 
 from collections.abc import Callable
@@ -24,22 +24,22 @@ from ..results import Status
 from .base import AbstractCondition, BifurcationPoint, given_point
 from .forced import forced_point
 from .path import ParameterPath
-from .scan import search
+from .scan import MOST_ATTEMPTS, search
 
-#: Points found in two ways are one if they are no further apart.
+#: Points found in two ways count as one if they are no farther apart.
 SAME_POINT = 1e-9
-#: A point with a larger error is asked again from so near by, in units of the parameter.
+#: A point with a larger error is solved again from a guess so near, in units of the parameter.
 BESIDE_IT = 1e-3
-#: Where Newton's method ends so near to the guess, there is no look for a nearer point, if its
-#: first step was no longer than that. Of three thousand guesses four led beyond the next point,
-#: to others 0.008, 0.018 and 0.029 away, after first steps of 0.4 and 0.5, and to a corner 0.004
-#: away beside another one. Of edges and of folds of cycles there may be several, and any is looked
-#: for: one fold of cycles was passed for another one 5e-4 farther off.
+#: If Newton's method ends this near to the guess after a first step that is no longer than
+#: SHORT_STEP, no nearer point is searched. Of three thousand guesses four led beyond the next
+#: point, to others 0.008, 0.018 and 0.029 away, after first steps of 0.4 and 0.5, and to a corner
+#: 0.004 away beside another one.
 QUITE_NEAR, SHORT_STEP = 0.05, 0.25
-#: The same after a longer step, and for conditions of which there may be several beside each other.
+#: The same after a longer step, and for conditions of which there may be several points beside each
+#: other: one fold of cycles was passed for another one 5e-4 farther off.
 BESIDE_OTHERS = 1e-4
-#: How far to both sides of the guess points are looked for where it fails, one after the other, and
-#: in how many intervals first. All of these in units of the parameter, see `Family.unit`.
+#: Reaches of the search on both sides of the guess, in order, and its number of intervals. All of
+#: these in units of the parameter, see `Family.unit`.
 REACHES, INTERVALS = (2e-3, 1.2e-2, 5e-2, 0.2), 15
 
 
@@ -55,38 +55,48 @@ def refine(
 ) -> BifurcationPoint:
     """The bifurcation point near an oscillator, by Newton's method with exact derivatives.
 
-    condition: `Hopf()`, `NonsmoothFold(belt)`, `GrazingSliding(belt)`, `SlidingExchange(belts)`,
-    `CrossingSliding(belt)`, `SuddenSliding(belt)`, `BeltAtRest(belt)`, `FoldOfCycles()`,
-    `HopfAtInfinity()`, or of a belt with a contact edge `GrazingEdge(belt)`,
-    `CornerCollision(belt)`, `BoundaryEquilibrium(belt)`, `PseudoHopf(belt)` or
-    `SaddleConnection(belt)`, of two such belts `EdgeExchange(belts)` or `MeetingEdges(belts)`; or
-    one of your own. osc: a rough guess, on either side of the point. where: selects the parameter
-    that is varied, such as `lambda osc: osc.belts[0].velocity`. Or osc, without where: a function
-    of the parameter that returns the oscillator, of what JAX can differentiate; and at: the value
-    of the parameter to begin from. max_arcs: room for the arcs of one loop (default 16; where edges
-    are passed 32).
+    Newton's method follows one cycle: of the attracting ones at the guess the one that is nearest
+    to the condition. So of points on coexisting cycles it need not find the nearest; `scan` finds
+    all. Of several states of rest, as on two edges, all are solved for, and the nearest point (for
+    a function the nearest along its tangent) is taken.
 
-    Newton's method follows one cycle: of the attracting ones at the guess that which is nearest to
-    the condition. So of points on coexisting cycles it need not find the nearest; `scan` finds all.
-    Of several states of rest, as on two edges, all are solved for, and the point that is nearest,
-    of a function along its tangent, is taken.
-    Where it does not converge, what `scan` does is done around the guess, up to 0.2 to both sides,
-    and the nearest point of that kind is taken, of any cycle; so it is where it ends further from
-    the guess than 0.05, or, after a first step of more than 0.25, or of folds of cycles and of what
-    edges do, than 1e-4 (in units of the parameter). This takes some tenths of a second to two
-    rather than milliseconds.
+    Where Newton's method does not converge, the search of `scan` is done around the guess, up to
+    0.2 to both sides, and the nearest point of that kind is taken, of any cycle. The same happens
+    where it ends farther from the guess than 0.05, or than 1e-4 after a first step of more than
+    0.25 and for folds of cycles and conditions on edges (in units of the parameter). This takes
+    some tenths of a second to two seconds rather than milliseconds.
 
-    Works under `jax.vmap` (a thousand points of a curve in one call) and `jax.jit`, without that
-    second look; `value` and `cycle` are differentiable with respect to the other parameters. A
-    guess that leads to no such point gives a status that says why, and NaN. `ValueError` names an
-    impossible argument.
+    Works under `jax.vmap` (a thousand points of a curve in one call) and `jax.jit`, without the
+    second search. `value` and `cycle` are differentiable with respect to the other parameters.
 
-    Of forced oscillators the conditions are those on a periodic motion: `PeriodDoubling()`,
+    For forced oscillators the conditions are those on a periodic motion: `PeriodDoubling()`,
     `Fold()`, `Torus()`, `GrazingSliding(belt)`, `CrossingSliding(belt)`, `SwitchingSliding(belt)`
-    and `AddingSliding(belt)`. start: the motion to begin from, or a start (x1, x2) at t = 0 that
-    leads to it; None: motions to which some starts lead, and of those with an even number of
-    periods the one that they may have left. The nearest point is taken; not under `jax.vmap` and
-    `jax.jit`.
+    and `AddingSliding(belt)`. The nearest point is taken; not under `jax.vmap` and `jax.jit`.
+
+    Args:
+        condition: `Hopf()`, `NonsmoothFold(belt)`, `GrazingSliding(belt)`,
+            `SlidingExchange(belts)`, `CrossingSliding(belt)`, `SuddenSliding(belt)`,
+            `BeltAtRest(belt)`, `FoldOfCycles()`, `HopfAtInfinity()`; for a belt with a contact edge
+            `GrazingEdge(belt)`, `CornerCollision(belt)`, `BoundaryEquilibrium(belt)`,
+            `PseudoHopf(belt)` or `SaddleConnection(belt)`; for two such belts `EdgeExchange(belts)`
+            or `MeetingEdges(belts)`; or your own condition.
+        osc: A rough guess, on either side of the point; or a function of the parameter that returns
+            the oscillator and that JAX can differentiate.
+        where: Selects the parameter that is varied, such as `lambda osc: osc.belts[0].velocity`;
+            None with a function.
+        at: With a function: the value of the parameter to begin from.
+        max_arcs: Room for the arcs of one loop (default 16; 32 where edges are passed).
+        start: For a forced oscillator only: the motion to begin from, or a start (x1, x2) at t = 0
+            that leads to it; None: motions to which some starts lead, and of those with an even
+            number of periods the one that they may have left.
+
+    Returns:
+        The `BifurcationPoint`. Without a point near the guess its status says why, and its value is
+        NaN; where something changes nearby that no condition explains, `sides` says what there is
+        below and above.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
     fits = isinstance(condition, AbstractCondition)
     require_value(fits, "condition", "such as jb.Hopf()", condition)
@@ -103,7 +113,7 @@ def refine(
 
 
 def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> BifurcationPoint:
-    """The point, or one of its kind that is nearer to the guess, from what `scan` does there."""
+    """The point, or one of its kind that is nearer to the guess, from the search of `scan`."""
     condition, guess = point.condition, float(value[0])
     if int(point.status) == Status.DEGENERATE:
         return point
@@ -112,17 +122,21 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
     is_direct = bool(np.asarray(point.steps)[0] <= SHORT_STEP) and not condition.has_several
     if away <= unit * (QUITE_NEAR if is_direct else BESIDE_OTHERS):
         return point
+    attempts, unexplained = 0, []
     for reach in (unit * each for each in REACHES):
         ends = (guess + side * min(reach, away) for side in (-1, 1))
         first, last = (_possible(variation, guess, end) for end in ends)
         if not first < last:
             break
         path = ParameterPath(variation, None, (first, last), [condition])
-        # From farther off, too, than in `scan`: these paths are short.
-        found = search(path, INTERVALS, near=1.0)
-        found = [one for one in found if int(one.status) == Status.OK]
-        # What attracts may tell a point as one of another kind, too; or two are so near to each
-        # other that the search tells one of them; or it is of one of two belts of one velocity.
+        # From farther off than in `scan`, as these paths are short.
+        path.attempts = attempts
+        searched = search(path, INTERVALS, near=1.0, known=unexplained)
+        attempts = path.attempts
+        unexplained += [one for one in searched if int(one.status) == Status.UNEXPLAINED]
+        found = [one for one in searched if int(one.status) == Status.OK]
+        # The search may report a point as one of another kind, too; or two are so near to each
+        # other that it reports one of them; or it is of one of two belts with one velocity.
         values = [
             float(one.value)
             for one in found
@@ -131,30 +145,35 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
         ]
         values += [beside for value in values for beside in path.beside(value)]
         within = (value for value in values if first <= value <= last)
-        also = (condition.found_from(variation, value) for value in within)
+        also = (condition.named_point_from(variation, value) for value in within)
         found += [one for one in also if one is not None]
-        # Any of these may have led to one that is farther away than others beyond the reach.
+        # Any of these may have led to a point that is farther away than others beyond the reach.
         of_kind = [one for one in found if condition.covers(one) and _away(one, guess) <= reach]
         if of_kind:
             nearest = min(of_kind, key=lambda one: _away(one, guess))
             nearest = _more_exact(nearest, condition, variation, unit)
             is_nearer = _away(nearest, guess) < away - unit * SAME_POINT
             return replace(nearest, condition=condition) if is_nearer else point
-        if away <= reach:
+        if away <= reach or attempts > MOST_ATTEMPTS:
             break
+    if int(point.status) != Status.OK and unexplained:
+        nearest = min(unexplained, key=lambda one: abs(float(one.value) - guess))
+        return replace(point, sides=nearest.sides)
     return point
 
 
 def _more_exact(
     point: BifurcationPoint, condition: AbstractCondition, variation: Variation, unit: float
 ) -> BifurcationPoint:
-    """The point as it is found from nearer by, if that is more exact: steps of integration suit the
-    motion at the guess."""
+    """The point as solved from a nearer guess, if that is more exact.
+
+    The integration steps suit the motion at the guess.
+    """
     value = float(point.value)
     for shift in (-BESIDE_IT, BESIDE_IT):
         if not float(point.error) > unit * EXACT:
             break
-        again = condition.found_from(variation, value + shift * unit)
+        again = condition.named_point_from(variation, value + shift * unit)
         if again is not None and abs(float(again.value) - value) < unit * SAME_POINT:
             point = min(point, again, key=lambda one: float(one.error))
     return point
@@ -165,7 +184,7 @@ def _away(point: BifurcationPoint, guess: float) -> float:
 
 
 def _possible(variation: Variation, guess: float, end: float) -> float:
-    """The end of a way from the guess, or one nearer to it beyond which there is no oscillator."""
+    """The end of a way from the guess, or a nearer value up to which there is an oscillator."""
     for _ in range(8):
         try:
             variation.check(end)
@@ -179,7 +198,7 @@ def _possible(variation: Variation, guess: float, end: float) -> float:
 def _begun(
     condition: AbstractCondition, osc: Any, where: Any, at: Any
 ) -> tuple[Variation, Oscillator, Any]:
-    """What is varied, and the oscillator and the value, [1], to begin from, in own units."""
+    """The variation, and the oscillator and the value, [1], to begin from, in own units."""
     if isinstance(osc, Oscillator) or not callable(osc):
         require_value(at is None, "at", "left out where osc is an Oscillator", at)
         check_oscillator(osc)

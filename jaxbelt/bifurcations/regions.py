@@ -1,8 +1,8 @@
 """The regions of a plane of two parameters: `region_map`.
 
-Each cell of the plane is named by what it has (see `cells`). What bounds the regions is not read
-off the cells: curves of bifurcation points are followed, until they pass between all neighbouring
-cells that differ (see `bounds`).
+Each cell of the plane is named after its motions (see `cells`). The bounds of the regions are not
+read off the cells: curves of bifurcation points are followed, until they pass between all
+neighbouring cells that differ (see `bounds`).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -35,7 +35,7 @@ from ..numerics.widths import as_here
 from ..results import draw
 from ..tables import table_of
 from .bounds import Bounds, Pair
-from .cells import in_plane_of_paper, look_at
+from .cells import in_plane_of_paper, motions_in_cells
 from .curves import BifurcationCurve, given_curve
 from .faces import Faces
 
@@ -44,24 +44,30 @@ if TYPE_CHECKING:
 
 
 class RegionMap(eqx.Module):
-    """What `region_map` returns.
+    """The regions of a plane of two parameters; what `region_map` returns.
 
-    names: of the two parameters, as arguments of `make`; values: of each, [n] and [m]; label: name
-    of the region, [n, m], see below, "" where the runs were undecided; curves: what bounds the
-    regions, see `BifurcationCurve`; cycles: by the name of a region, the cycles in its example,
-    attracting ones and the unstable one; on_line: cells where a belt is at rest, or two run at one
-    velocity, [n, m]: what is so on that line only is the name of these; between: (p, q, name) in
-    each part of the plane between curves in which there is no other cell; make: as given;
-    uncovered: pairs of neighbouring cells, ((p, q), (p, q)), that differ, though no curve passes
-    within half a cell and none was found between them.
-    `words` says what the names mean; `example(name)` is a cell well inside a region; `table()` has
-    the curves as rows; `plot()` draws the map, with a portrait of each region.
+    `words` explains the names; `example(name)` is a cell well inside a region; `table()` has the
+    curves as rows; `plot()` draws the map, with a portrait of each region.
 
     In the name of a region a digit says what attracts: 1 an equilibrium only, 2 a cycle, too, 3
     cycles only; 6, 5 and 4 are the same where belts run in opposite directions. With several belts
     a letter for each cycle says what it sticks to: a belt 0, b belt 1, c both (d belt 2, and on as
     binary digits); s, with one belt too, is a cycle that never sticks. These are the names of the
     paper's Fig. 6; pictures show them in its plane only, as notebook 03 does.
+
+    Attributes:
+        names: Names of the two parameters, arguments of `make`.
+        values: Values of each, [n] and [m].
+        label: Names of the regions, [n, m], "" where the runs were undecided.
+        curves: Bounds of the regions, see `BifurcationCurve`.
+        cycles: By the name of a region, the cycles in its example, attracting ones and the unstable
+            one.
+        on_line: Cells where a belt is at rest, or two belts have one velocity, [n, m]; their names
+            hold on that line only.
+        between: (p, q, name) in each part of the plane between curves that contains no cell.
+        make: The given function.
+        uncovered: Pairs of neighbouring cells, ((p, q), (p, q)), that differ, though no curve
+            passes within half a cell and none was found between them.
     """
 
     names: tuple[str, str] = eqx.field(static=True)
@@ -81,8 +87,11 @@ class RegionMap(eqx.Module):
 
     @property
     def words(self) -> dict[str, str]:
-        """What the name of each region says: what attracts, and which belts each cycle sticks to;
-        that belts run in opposite directions where that differs. As in the key of `plot()`."""
+        """Meaning of the name of each region, as in the key of `plot()`.
+
+        It says what attracts, which belts each cycle sticks to, and, where that differs, that belts
+        run in opposite directions.
+        """
         names = sorted({*self.regions, *(name for *_, name in self.between)})
         opposite = {name: f"; {OPPOSITE}" * (name[0] in "456") for name in names}
         if len(set(opposite.values())) < 2:
@@ -92,31 +101,47 @@ class RegionMap(eqx.Module):
         return {name: _attractors_of(heads[name], belts) + opposite[name] for name in names}
 
     def example(self, name: str) -> tuple[float, float]:
-        """The values of the parameters in the cell of a region that is farthest from its bounds."""
+        """The cell of a region that is farthest from its bounds.
+
+        Args:
+            name: Name of the region.
+
+        Returns:
+            The values of the parameters in that cell.
+
+        Raises:
+            ValueError: If there is no such region.
+        """
         require_one_of(name, self.regions, "name")
         return _example(self.values, self.label == name)
 
     def oscillator(self, name: str) -> Oscillator:
-        """The oscillator in that cell."""
+        """The oscillator in the cell of `example`."""
         return _at(self.make, self.names, self.example(name))
 
     @property
     def as_paper(self) -> bool:
-        """Whether the plane is that of the paper's Fig. 6, the velocities of the paper's class (b):
-        pictures show the names of the regions there only."""
+        """Whether the plane is that of the paper's Fig. 6, the velocities of the paper's class (b).
+
+        Pictures show the names of the regions there only.
+        """
         corners = [(p, q) for p in self.values[0][[0, -1]] for q in self.values[1][[0, -1]]]
         return in_plane_of_paper([_at(self.make, self.names, corner) for corner in corners])
 
     def raster(self) -> np.ndarray:
-        """The name at every point of an even raster over the plane, on the side of each exact curve
-        that the point is on, [pixels, pixels], the first parameter along the rows."""
+        """Names on an even raster over the plane, [pixels, pixels], the first parameter along the
+        rows.
+
+        Every point has the name of its own side of each exact curve.
+        """
         faces, points, names = _faces_of(self.values, self.label, self.on_line, self.curves)
         extra = [(p, q) for p, q, _ in self.between]
         points = np.concatenate([points, np.array(extra).reshape(-1, 2)])
         return faces.named(points, [*names, *(name for *_, name in self.between)])
 
     def table(self) -> "pandas.DataFrame":
-        """All curves in rows, with their number: see `BifurcationCurve.table`."""
+        """Returns all curves in rows, with their number; other columns: see
+        `BifurcationCurve.table`."""
         return table_of(
             [
                 {"curve": number, **row}
@@ -126,10 +151,14 @@ class RegionMap(eqx.Module):
         )
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw the map into the axes `ax`, which are returned.
+        """Draws the map.
 
-        None: new ones, and a sketch of the phase portrait of each region in its example beside
-        them, as in the paper's Fig. 6.
+        Args:
+            ax: Axes. None makes new ones, and beside them a sketch of the phase portrait of each
+                region in its example, as in the paper's Fig. 6.
+
+        Returns:
+            The axes of the map.
         """
         return draw(self, ax)
 
@@ -144,12 +173,12 @@ class RegionMap(eqx.Module):
         )
 
 
-#: How the words for a region end whose belts run in opposite directions.
+#: End of the words for a region whose belts run in opposite directions.
 OPPOSITE = "belts opposite"
 
 
 def _attractors_of(name: str, belts: int) -> str:
-    """In words what attracts in a region of that name, of so many belts."""
+    """Words for what attracts in a region of that name; belts: their number."""
     digit, letters = name[:1], name[1:]
     words = ["rest"] if digit in ("1", "2", "5", "6") else []
     if belts == 1:
@@ -168,7 +197,8 @@ def interior(inside: np.ndarray) -> tuple[int, int]:
 
     Of several the last one: where the plane is symmetric, that with the larger parameters.
     """
-    from scipy.ndimage import distance_transform_edt  # a quarter of a second that only maps need
+    # import takes a quarter of a second, which only maps need
+    from scipy.ndimage import distance_transform_edt
 
     depth = np.asarray(distance_transform_edt(np.pad(inside, 1)))[1:-1, 1:-1]
     row, column = np.argwhere(depth > np.max(depth) - 1e-9)[-1]
@@ -185,14 +215,22 @@ def region_map(
     step: float = 0.01,
     lines: int = 4,
 ) -> RegionMap:
-    """Which motions there are in each cell of a plane of two parameters, and what bounds them.
+    """The regions of a plane of two parameters, with the exact curves that bound them.
 
-    make: gives an `Oscillator`, such as `jb.presets.class_b`; axes: two of its arguments and their
-    values, increasing. starts: further ones, (x1, x2), from which each cell is run; those from
-    which `scan` follows orbits are always taken, and what attracts none of them is not seen. step:
-    between the points of the curves, in units of the larger side of the map / 1.4; lines: on how
-    many lines parallel to each axis curves are looked for first, then between the cells that
-    differ; 0 for no curves. `ValueError` names an impossible argument.
+    Args:
+        make: Function that returns an `Oscillator`, such as `jb.presets.class_b`.
+        axes: Two of its arguments and their values, increasing.
+        starts: Further starts, (x1, x2), of the runs in each cell. The starts from which `scan`
+            follows orbits are always taken; an attractor that none of them leads to is not seen.
+        step: Distance between the points of curves, in units of the larger side of the map / 1.4.
+        lines: Number of lines parallel to each axis on which curves are searched first; then they
+            are searched between the cells that differ. 0: no curves.
+
+    Returns:
+        The `RegionMap`.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
     expected = "a dictionary, two arguments of make and their values"
     require_value(isinstance(axes, Mapping) and len(axes) == 2, "axes", expected, axes)
@@ -218,9 +256,9 @@ def region_map(
     def own(**numbers):
         return variation.own.of(make(**numbers))
 
-    # Two things that know nothing of each other, most of the first time compiling.
+    # Two independent computations, most of whose first time is compilation.
     with ThreadPoolExecutor(1) as beside:
-        seen = beside.submit(as_here(_look_at_all), own, span, values, own_starts)
+        seen = beside.submit(as_here(_motions_in_all), own, span, values, own_starts)
         if lines:
             bounds.search_lines(lines)
         label, motions, on_line = seen.result()
@@ -238,7 +276,7 @@ def region_map(
 
 
 def varied_by_names(make, names: tuple[str, str], values: Sequence[np.ndarray]) -> Variation:
-    """What is varied in a plane of two arguments of `make`; values: of both, possible ones."""
+    """The variation of two arguments of `make`; values: possible ones of both."""
 
     def at(p, q):
         return make(**dict(zip(names, (p, q), strict=True)))
@@ -247,11 +285,14 @@ def varied_by_names(make, names: tuple[str, str], values: Sequence[np.ndarray]) 
     return replace(Variation.of_function(at, corner, "make"), names=names)
 
 
-def _look_at_all(make, names, values, starts):
-    """The names of all cells, numbers of what there is in them, and which lie on a line where
-    velocities meet, [n, m] each."""
+def _motions_in_all(make, names, values, starts):
+    """Names of all cells, numbers of the motions in them, and whether they lie on a line, [n, m]
+    each.
+
+    On these lines velocities meet.
+    """
     grid = np.meshgrid(*values, indexing="ij")
-    cells = look_at(make, names, np.column_stack([axis.ravel() for axis in grid]), starts)
+    cells = motions_in_cells(make, names, np.column_stack([axis.ravel() for axis in grid]), starts)
     shape = grid[0].shape
     return cells.names.reshape(shape), cells.motions.reshape(shape), cells.on_line.reshape(shape)
 
@@ -271,23 +312,23 @@ def _at(make, names, pair) -> Oscillator:
 
 
 def _faces_of(values, label, on_line, curves) -> tuple[Faces, np.ndarray, list[str]]:
-    """The faces of a map, and the cells that tell what is in an area, with their names."""
-    (p, q), told = values, (label != "") & ~on_line
+    """The faces of a map, and the cells that determine the name of an area, with their names."""
+    (p, q), known = values, (label != "") & ~on_line
     faces = Faces(((p[0], p[-1]), (q[0], q[-1])), [curve.path for curve in curves])
-    rows, columns = np.nonzero(told)
-    return faces, np.column_stack([p[rows], q[columns]]), label[told].tolist()
+    rows, columns = np.nonzero(known)
+    return faces, np.column_stack([p[rows], q[columns]]), label[known].tolist()
 
 
 def _names_between(make, names, values, label, on_line, curves, starts):
-    """What there is in each part of the plane between curves in which there is no cell."""
+    """The motions in each part of the plane between curves that contains no cell."""
     if not curves:
         return ()
     faces, points, _ = _faces_of(values, label, on_line, curves)
     unnamed = faces.unnamed(points)
     if not unnamed:
         return ()
-    told = look_at(make, names, np.array(unnamed), starts).names.tolist()
-    return tuple((*point, name) for point, name in zip(unnamed, told, strict=True) if name)
+    found = motions_in_cells(make, names, np.array(unnamed), starts).names.tolist()
+    return tuple((*point, name) for point, name in zip(unnamed, found, strict=True) if name)
 
 
 def _checked_starts(starts: Any) -> tuple[tuple[float, float], ...]:

@@ -9,8 +9,8 @@ There is no cycle at these points, and few equations: in x1 of the state of rest
 - `BeltAtRest`: the same, if no cycle sticks to the belt: an equilibrium jumps, or a pseudo-focus on
   an edge becomes another one.
 
-Hopf's points are eqs. (27), (28) of the paper, and sudden sliding is its name. What happens on
-contact edges is in `edge_rests`.
+Hopf points are eqs. (27), (28) of the paper, and sudden sliding is its name. Bifurcations on
+contact edges are in `edge_rests`.
 """
 
 import abc
@@ -52,12 +52,12 @@ from .systems import RestSystem, judged_by, small_newton, third_derivative, velo
 
 #: The unknowns of a state of rest of which all is known.
 NOTHING = np.zeros(0)
-#: As the guess of a condition on several states of rest: any of them.
+#: Guess of a condition on several states of rest: any of them.
 ANY = np.array(-1)
-#: Coefficients smaller than this part of their terms are zero: points are good to some 1e-12.
+#: Coefficients smaller than this part of their terms count as zero: points are good to some 1e-12.
 DEGENERATE = 1e-9
-#: Where sudden sliding is looked for, relative to where the belt is at rest: orbits that settle
-#: soon first; other points may be nearer than where they do.
+#: Values at which sudden sliding is searched, relative to where the belt is at rest: first those
+#: where orbits converge quickly; other points may be nearer.
 BESIDE = (1e-2, -1e-2, 1e-4, -1e-4)
 
 # --- conditions on a state of rest ----------------------------------------------------------------
@@ -76,11 +76,11 @@ class AbstractRestCondition(AbstractCondition):
     def prepared(self, osc, guess):
         return _prepared_rest(self, osc, guess)
 
-    def solved(self, family, system, x, p, status):
+    def point_near(self, family, system, x, p, status):
         why = jnp.asarray(self.no_cycle.value)
         return _solved_rest(family, system, x, p, status, why)
 
-    def followed(self, point):
+    def system_at(self, point):
         osc, data = point.oscillator, self.as_data()
         return data.prepared(osc, data.guess(osc, self.room))[:2]
 
@@ -108,15 +108,15 @@ _solved_rest = jit(_rest_point)
 
 
 class AbstractRestOfSeveral(AbstractRestCondition):
-    """A condition on any of several states of rest: the point nearest to the guess counts, of a
-    function of the parameter that which is nearest along its tangents.
+    """A condition on any of several states of rest: the point nearest to the guess counts.
 
-    Its guess is the number of the one that is meant, or ANY.
+    For a function of the parameter it is the nearest along its tangents. The guess is the number of
+    the state of rest, or ANY.
     """
 
     @abc.abstractmethod
     def systems(self, osc: Oscillator) -> tuple[RestSystem, Any, Array]:
-        """The system of each, its unknowns, and a status, a row each; compiled."""
+        """The system of each state of rest, its unknowns, and a status, a row each; compiled."""
 
     def system(self, osc, guess):
         systems, x, status = self.systems(osc)
@@ -134,10 +134,10 @@ class AbstractRestOfSeveral(AbstractRestCondition):
         order = np.argsort(np.asarray(_misses(systems, osc, x)))
         return [np.array(row) for row in order if np.asarray(status)[row] == Status.OK]
 
-    def solved(self, family, system, x, p, status):
+    def point_near(self, family, system, x, p, status):
         return _solved_nearest(family, system, x, p, status, jnp.asarray(self.no_cycle.value))
 
-    def followed(self, point):
+    def system_at(self, point):
         systems, x, status = self.as_data().prepared(point.oscillator, ANY)
         row = _row_that_holds(systems, point.oscillator, x, status, point.x1, point.member)
         return _of_row((systems, x), row)
@@ -150,7 +150,7 @@ def _of_row(tree: Any, row: Array) -> Any:
 
 @jit
 def _misses(systems: RestSystem, osc: Oscillator, x: Array) -> Array:
-    """The largest error in the equations of each, [rows]; inf where it has none."""
+    """Largest error in the equations of each, [rows]; inf where there is no state of rest."""
     missed = jax.vmap(lambda system, x: jnp.max(jnp.abs(system.residual(osc, x))))(systems, x)
     return jnp.where(jnp.isfinite(missed), missed, jnp.inf)
 
@@ -159,8 +159,11 @@ def _misses(systems: RestSystem, osc: Oscillator, x: Array) -> Array:
 def _row_that_holds(
     systems: RestSystem, osc: Oscillator, x: Array, status: Array, x1: Array, row: ArrayLike
 ) -> Array:
-    """The row that holds, with the mass at rest at x1; of several this one if it is among them:
-    another may hold on the other side of the edge whatever the parameter is."""
+    """The row that holds, with the mass at rest at x1.
+
+    Of several rows that hold the given one, if it is among them: another may hold on the other side
+    of the edge whatever the parameter is.
+    """
     places = jax.vmap(lambda system, x: system.x1(osc, x))(systems, x)
     misses = _misses(systems, osc, x) + jnp.abs(places - x1)
     misses = jnp.where(status == Status.OK, misses, jnp.inf)
@@ -170,20 +173,22 @@ def _row_that_holds(
 
 @jit
 def _solved_nearest(family: Family, systems: RestSystem, x0, p0, status, why):
-    """Of the points of all systems that nearest to the guess; where there is none, what is said of
-    the system that comes nearest to its equations at the guess."""
+    """The point of any of the systems that is nearest to the guess.
 
-    def solved(family, row):
+    If there is none: the status of the system that comes nearest to its equations at the guess.
+    """
+
+    def at_row(family, row):
         system, x, said = jax.tree.map(lambda leaf: leaf[row], (systems, x0, status))
         return _rest_point(family, system, x, p0, said, why)
 
-    # The choice has no derivative; nor would that of what is found, beside rows of NaN.
+    # The choice has no derivative; nor would the point have one beside rows of NaN.
     fixed = lax.stop_gradient(family)
-    points, _ = jax.vmap(lambda row: solved(fixed, row))(jnp.arange(status.size))
+    points, _ = jax.vmap(lambda row: at_row(fixed, row))(jnp.arange(status.size))
     misses = jnp.where(status == Status.OK, _misses(systems, fixed.at(p0), x0), jnp.inf)
     away = jnp.where(points.status == Status.OK, jnp.abs(points.value - p0[0]), jnp.inf)
     row = jnp.where(jnp.any(jnp.isfinite(away)), jnp.argmin(away), jnp.argmin(misses))
-    point, (x, p) = solved(family, row)
+    point, (x, p) = at_row(family, row)
     return replace(point, member=row), (x0.at[row].set(x), p)
 
 
@@ -212,7 +217,7 @@ class HopfSystem(RestSystem):
         return jnp.min(jnp.stack(edge_guards(osc, mode_of(self.codes), x[0])))
 
     def is_on_edge(self, osc: Oscillator, x: Array) -> Array:
-        """Whether the fixed point lies on a contact edge, to rounding."""
+        """Whether the fixed point lies on a contact edge, up to rounding."""
         return self._nearest_edge(osc, x) <= edge_rounding(x[0])
 
     def tests(self, osc, x):
@@ -248,10 +253,10 @@ class Hopf(AbstractRestOfSeveral):
         return bool(_is_on_edge(point.oscillator, point.x1))
 
     def type_of(self, point):
-        return criticality(*_hopf_growth(*self.followed(point), point.oscillator))
+        return criticality(*_hopf_growth(*self.system_at(point), point.oscillator))
 
     def coefficient(self, point):
-        return _hopf_growth(*self.followed(point), point.oscillator)[0]
+        return _hopf_growth(*self.system_at(point), point.oscillator)[0]
 
     def place(self, point):
         return np.array([point.x1, point.x1, 0.0, 0.0, 0.0])
@@ -264,7 +269,7 @@ def _is_on_edge(osc: Oscillator, x1: Array) -> Array:
 
 
 def criticality(coefficient: Array, size: Array) -> str:
-    """The type of a point at which a cycle is born; size: of the terms of the coefficient."""
+    """Type of a point at which a cycle is born; size: of the terms of the coefficient."""
     if not abs(coefficient) > DEGENERATE * size:
         return "degenerate"
     return "subcritical" if coefficient > 0 else "supercritical"
@@ -287,10 +292,10 @@ def _hopf_growth(system: HopfSystem, x1: Array, osc: Oscillator) -> tuple[Array,
 
 
 def hopf_limit(kind: str, trail: Trail, vanishes: Callable, *args: Array) -> SpecialPoint | None:
-    """Where the cycle of a curve has shrunk to an equilibrium, if that is near.
+    """The point where the cycle of a curve has shrunk to an equilibrium, if that is near.
 
-    Its own equations are singular there, those of a Hopf point at which vanishes(osc, codes, x1,
-    *args) is zero, too, are not.
+    The cycle's own equations are singular there; those of a Hopf point at which also vanishes(osc,
+    codes, x1, *args) is zero are not.
     """
     x1 = trail.x[:, 0]
     if np.ptp(x1) > 5 * trail.step:
@@ -309,14 +314,14 @@ def hopf_limit(kind: str, trail: Trail, vanishes: Callable, *args: Array) -> Spe
 def limit_near(
     trail: Trail, attempt: Callable, guess: tuple, ahead, away: float, kind: str, *belts: int
 ) -> SpecialPoint | None:
-    """What a curve leads to, if that is found and no farther than `away` from `ahead`.
+    """The point that a curve leads to, if it is found and no farther than `away` from `ahead`.
 
-    attempt: see `Variation.settle`; it gives the unknowns, of which both parameters are the last,
-    and the error.
+    attempt: see `Variation.relinearised`; it returns the unknowns, of which both parameters are the
+    last, and the error.
     """
-    (found, residual), settled = trail.variation.settle(attempt, guess)
+    (found, residual), agrees = trail.variation.relinearised(attempt, guess)
     values = np.asarray(found)[-2:]
-    if not (settled and residual < HOLDS and np.linalg.norm(values - ahead) < away):
+    if not (agrees and residual < HOLDS and np.linalg.norm(values - ahead) < away):
         return None
     return SpecialPoint(kind, belts, (float(values[0]), float(values[1])), float(residual))
 
@@ -340,8 +345,8 @@ def _special_hopf(family: Family, codes, guess: Array, vanishes, *args):
 class RestingBelt(RestSystem):
     """A belt comes to rest, and the mass rests on it in the mode of `codes`; the unknown is x1.
 
-    side: of the direction in which the belts at rest hold all they can, 0 where they hold nothing;
-    sticks: whether that is what was meant; edge: the number of that on which the mass rests as a
+    side: direction in which the belts at rest hold all they can, 0 where they hold nothing; sticks:
+    whether that is the case to solve for; edge: number of the edge on which the mass rests as a
     pseudo-focus, -1 where it does not.
     """
 
@@ -368,7 +373,7 @@ class RestingBelt(RestSystem):
 
 
 class StoppedBelt(RestSystem):
-    """The velocity of a belt is zero; wherever the mass rests then."""
+    """The velocity of a belt is zero, wherever the mass rests then."""
 
     belt: int | Array
 
@@ -387,29 +392,33 @@ class StoppedBelt(RestSystem):
 
 
 class _RestingBeltCondition(AbstractRestCondition):
-    """A belt comes to rest; whether a cycle sticks to it before, or after, tells the kind."""
+    """A belt comes to rest; the kind depends on whether a cycle sticks to it before, or after."""
 
     belt: int | Array
 
-    family: ClassVar[str] = "rest"
+    group: ClassVar[str] = "rest"
     joins: ClassVar[bool] = False
 
     @classmethod
     def at_coincidence(cls, belts):
         return [cls(*belts)] if len(belts) == 1 else []
 
-    def followed(self, point):
+    def system_at(self, point):
         return StoppedBelt(jnp.asarray(self.belt)), NOTHING
 
     def kind_along(self, osc, multiplier):
         number = leaf_index(osc, lambda osc: osc.belts[int(self.belt)].velocity)
         velocity, sudden = Variation.of_leaves(osc, [number]), SuddenSliding(self.belt)
-        found = (sudden.found_from(velocity, value) for value in sudden.values(0.0, 0.0))
+        found = (sudden.named_point_from(velocity, value) for value in sudden.values(0.0, 0.0))
         return BeltAtRest if next(filter(None, found), None) is None else SuddenSliding
 
 
 class SuddenSliding(_RestingBeltCondition):
-    """A belt comes to rest: the time that the mass sticks to it in each loop goes to infinity."""
+    """A belt comes to rest: the time that the mass sticks to it in each loop goes to infinity.
+
+    Args:
+        belt: Number of the belt.
+    """
 
     no_cycle: ClassVar[Status] = Status.STUCK_FOREVER
     line: ClassVar[Line] = Line("sudden sliding", "black", (0, (4, 1.2)))
@@ -435,9 +444,12 @@ class SuddenSliding(_RestingBeltCondition):
 class BeltAtRest(_RestingBeltCondition):
     """A belt comes to rest where the mass is at rest on it, too, and no cycle sticks to it.
 
-    On the other side its friction pulls the other way: the equilibrium jumps, or there is none. A
-    pseudo-focus on an edge stays, but one of another stability: it repels on one side at least, and
+    On the other side its friction has the other direction: the equilibrium jumps, or there is none.
+    A pseudo-focus on an edge stays, with another stability: it repels on one side at least, and
     attracts where the belt is at rest, so a cycle around it shrinks to it; or there is none.
+
+    Args:
+        belt: Number of the belt.
     """
 
     line: ClassVar[Line] = Line("belt at rest", "black", (0, (1, 1.2)))
@@ -464,8 +476,7 @@ class BeltAtRest(_RestingBeltCondition):
 
 
 def _focus_changes(osc: Oscillator, belt: int | Array, edge: Array) -> Array:
-    """Whether the pseudo-focus on an edge that a belt touches is another one, or none, beside the
-    point at which that belt is at rest.
+    """Whether the pseudo-focus on an edge differs beside the point at which a belt is at rest.
 
     Where it attracts on both sides nothing changes; nor where another belt at rest brakes there.
     """

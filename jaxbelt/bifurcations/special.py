@@ -1,5 +1,7 @@
-"""Points of codimension two, which curves of bifurcation points pass or end in: `SpecialPoint`; and
-the last stretch of a curve, by which its condition tells what it ends in: `Trail`."""
+"""Points of codimension two, which curves of bifurcation points pass or end in: `SpecialPoint`.
+
+And the last stretch of a curve, from which its condition finds the point that it ends in: `Trail`.
+"""
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,26 +18,32 @@ if TYPE_CHECKING:
 
 #: A curve that comes so near to a belt at rest comes no nearer in any number of steps.
 CREEPS = 1e-6
-#: A cycle that reaches less far beyond an edge all but touches it; by less is rounding.
+#: A cycle that reaches less far than TOUCHES beyond an edge hardly touches it; less than TOUCHED is
+#: rounding.
 TOUCHES, TOUCHED = 1e-5, 1e-13
 
 
 class SpecialPoint(NamedTuple):
     """A point of codimension two on a curve.
 
-    kind: "DegenerateHopf" (first Lyapunov coefficient 0: a fold of cycles shrinks to a Hopf point),
-    "DegeneratePseudoHopf" (the same at a pseudo-focus), "DoubleBoundaryEquilibrium" (both sides of
-    the edge have their equilibrium on it: persistence turns into annihilation),
+    Kinds are "DegenerateHopf" (first Lyapunov coefficient 0: a fold of cycles shrinks to a Hopf
+    point), "DegeneratePseudoHopf" (the same at a pseudo-focus), "DoubleBoundaryEquilibrium" (both
+    sides of the edge have their equilibrium on it: persistence turns into annihilation),
     "FoldGrazing" (a cycle of multiplier 1 touches a boundary: a nonsmooth fold turns into a grazing
-    point, and a fold of cycles ends), "DoubleSliding" (another boundary is touched, too, or
-    met where the cycle passes an edge),
-    "EdgeTouch" (on an edge a cycle turns back, is tangent to a boundary, or begins to slip),
-    "BoundaryHopf" (a Hopf point on a contact edge: there the curves of boundary equilibria and of
-    pseudo-Hopf points meet its own), "BoundaryEquilibrium" (a side of a saddle ceases to push away,
-    and its connection ends), "MeetingEdges" (the saddles of a connection come together),
-    "BeltAtRest", "EqualVelocities", or what a condition of your own watches; belts: concerned;
-    values: of the two parameters; residual: the largest error in all equations; where the end of a
-    curve is extrapolated, of that.
+    point, and a fold of cycles ends), "DoubleSliding" (another boundary is touched, too, or met
+    where the cycle passes an edge), "EdgeTouch" (on an edge a cycle turns back, is tangent to a
+    boundary, or begins to slip), "BoundaryHopf" (a Hopf point on a contact edge: there the curves
+    of boundary equilibria and of pseudo-Hopf points meet its own), "BoundaryEquilibrium" (a side of
+    a saddle ceases to push away, and its connection ends), "MeetingEdges" (the saddles of a
+    connection come together), "BeltAtRest", "EqualVelocities", or a function that your own
+    condition watches.
+
+    Attributes:
+        kind: The kind.
+        belts: Numbers of the belts concerned.
+        values: Values of the two parameters.
+        residual: Largest error in all equations; where the end of a curve is extrapolated, error of
+            that.
     """
 
     kind: str
@@ -44,31 +52,43 @@ class SpecialPoint(NamedTuple):
     residual: float
 
     def measured_in(self, units: np.ndarray) -> "SpecialPoint":
-        """The same with parameters that were in these units, [2]."""
+        """The same point for parameters that were in these units, [2]."""
         first, second = (value * float(unit) for value, unit in zip(self.values, units))
         return self._replace(values=(first, second))
 
     def table(self) -> "pandas.DataFrame":
-        """One row: kind, belts, value_0 and value_1 of the two parameters, residual."""
+        """Returns one row; columns: kind, belts, value_0 and value_1 of the two parameters,
+        residual."""
         belts, (first, second) = " ".join(map(str, self.belts)), self.values
         row = {"kind": self.kind, "belts": belts, "value_0": first, "value_1": second}
         return table_of([row | {"residual": self.residual}])
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw it as a dot with its name in the plane of the two parameters, into the axes `ax`
-        (None: new ones), which are returned."""
+        """Draws the point as a dot with its name in the plane of the two parameters.
+
+        Args:
+            ax: Axes; None makes new ones.
+
+        Returns:
+            The axes.
+        """
         return draw(self, ax)
 
 
 def where_belts_stop(
     variation: Variation, values: np.ndarray, near: float, far: float
 ) -> SpecialPoint | None:
-    """Where belts come to rest at the end of a curve, if a parameter is so near to that.
+    """The point where belts come to rest at the end of a curve, if a parameter is near to that.
 
-    variation: of both; values: of the last rows, [rows, 2]; far: the point is not so far from the
-    last one. The time that the mass sticks goes to infinity there, so no step leads there. Where
-    two belts come to rest both parameters are known, else one: what the other comes to is
-    extrapolated, and the residual is by how much a parabola and a line differ there.
+    The time that the mass sticks goes to infinity there, so no step leads there. Where two belts
+    come to rest both parameters are known, else one: the limit of the other is extrapolated, and
+    the residual is the difference of a parabola and a line there.
+
+    Args:
+        variation: Of both parameters.
+        values: Values in the last rows, [rows, 2].
+        near: Distance of a parameter from its value at rest up to which the point counts.
+        far: Largest distance of the point from the last row.
     """
     if len(values) < 3 or has_clock(variation.oscillator(values[-1])):
         return None
@@ -100,12 +120,17 @@ def where_belts_stop(
 def where_edge_is_touched(
     variation: Variation, values: np.ndarray, places: np.ndarray, far: float
 ) -> SpecialPoint | None:
-    """Where the part of a cycle that is beyond a contact edge vanishes at the end of a curve.
+    """The point where the part of a cycle beyond a contact edge vanishes at the end of a curve.
 
-    values, places: of its last rows, [rows, 2] and [rows, 5]; far: the point is not so far from the
-    last one. That part takes a time that goes like the square root of how far it reaches, so no
-    step leads there; the parameters are linear in that root. The residual is how far the point is
+    The duration of that part goes like the square root of its extent beyond the edge, so no step
+    leads there; the parameters are linear in that root. The residual is the distance of the point
     from the last row.
+
+    Args:
+        variation: Of both parameters.
+        values: Values in the last rows, [rows, 2].
+        places: Places in the last rows, [rows, 5].
+        far: Largest distance of the point from the last row.
     """
     belts = variation.oscillator(values[-1]).belts
     edges = {float(edge) for belt in belts for edge in (belt.lower, belt.upper)}
@@ -126,7 +151,7 @@ def where_edge_is_touched(
 
 
 class Trail(NamedTuple):
-    """The last stretch of a curve, as its condition is asked where it leads.
+    """The last stretch of a curve, from which its condition finds where it leads.
 
     variation: of the two parameters; step: between rows; values: of the parameters in the last
     rows, three at most, [rows, 2]; system, x: of the last row; end: why the stretch ends there.
@@ -140,7 +165,7 @@ class Trail(NamedTuple):
     end: Stop
 
     def stopping(self) -> "Stopping | None":
-        """A belt that comes to rest and whose velocity one of the parameters alone decides."""
+        """A belt that comes to rest and whose velocity depends on one of the parameters alone."""
         if len(self.values) < 3:
             return None
         oscs = [self.variation.oscillator(row) for row in self.values]
@@ -159,8 +184,8 @@ class Trail(NamedTuple):
 class Stopping(NamedTuple):
     """A belt that comes to rest at the end of a curve.
 
-    held: which parameter decides its velocity, 0 or 1; belt: its number; value: of that parameter
-    where it is at rest; velocities: in the last rows.
+    held: the parameter that its velocity depends on, 0 or 1; belt: its number; value: of that
+    parameter where it is at rest; velocities: in the last rows.
     """
 
     held: int

@@ -1,19 +1,19 @@
-"""Nonsmooth folds as the switch model sees them: why published ones differ from the exact ones.
+"""Nonsmooth folds in the switch model: why published ones differ from the exact ones.
 
 The paper finds its folds by simulation of a switch model, eqs. (21)-(23): around the boundary of
 belt k lies a band |r| <= v_star. Within it the contact holds, x1' = nu_k/omega and r decays like
-exp(-t), until the needed force exceeds the capacity. So the mass is released not at r = 0 but at
-r = v_star exp(-tau), tau the time in the band, and does not come back quite as far as it would
-from r = 0. The cycle is lost too early, by about (m - 1) v_star over the speed at which the gap
-opens, m the multiplier of the cycle that it meets.
+exp(-t), until the needed force exceeds the capacity. So the mass is released not at r = 0 but at r
+= v_star exp(-tau), tau the time in the band, and does not come back quite as far as it would from r
+= 0. The cycle is lost too early, by about (m - 1) v_star over the speed at which the gap opens, m
+the multiplier of the cycle that it meets.
 
-How it is lost: the later the orbit enters the band, the less time is left for r to decay, the
-later it enters in the next loop. So the cycle that sticks meets another one that does, a smooth
-fold. With the unknowns (g, tau, T) of such a cycle, g how far before the point of x2' = 0 it
-enters, T the duration of slip, there are three equations: slip onset at the end of the band, and
+How it is lost: the later the orbit enters the band, the less time is left for r to decay, the later
+it enters in the next loop. So the cycle that sticks meets another one that sticks, a smooth fold.
+With the unknowns (g, tau, T) of such a cycle, g the distance before the point of x2' = 0 at which
+it enters, T the duration of slip, there are three equations: slip onset at the end of the band, and
 the orbit from there comes back to the entry (x1, x2). At the fold their Jacobian is singular; that
-is the fourth equation, for the fourth unknown, a parameter of the oscillator or v_star itself.
-As v_star goes to zero, g/v_star goes to m.
+is the fourth equation, for the fourth unknown, a parameter of the oscillator or v_star itself. As
+v_star goes to zero, g/v_star goes to m.
 """
 
 from collections.abc import Callable
@@ -39,7 +39,7 @@ from .tangencies import NonsmoothFold
 #: Integration steps of order twelve for the slip phase: with half as many folds move by 2e-12, with
 #: twice as many by 5e-15.
 SLIP_STEPS = 64
-#: The band of the first solution, and how many there are from it to the one wanted: so bands up to
+#: The band of the first solution, and the number of bands from it to the given one: so bands up to
 #: 1e-2 are reached; with three, or from 1e-8, up to 1e-3.
 FIRST, STAGES = 1e-6, 4
 #: Bands from which the search for the band of a given fold starts.
@@ -47,8 +47,11 @@ TYPICAL = 1e-4
 
 
 class SwitchFold(eqx.Module):
-    """A nonsmooth fold of the switch model: the value of the parameter, v_star, the largest error
-    in the equations. NaN where Newton's method found none."""
+    """A nonsmooth fold of the switch model; NaN where Newton's method found none.
+
+    value: of the parameter; v_star: half-width of the band; residual: largest error in the
+    equations.
+    """
 
     value: Array
     v_star: Array
@@ -58,11 +61,21 @@ class SwitchFold(eqx.Module):
 def switch_fold(
     point: BifurcationPoint, v_star: ArrayLike, *, where: Callable[[Oscillator], Any]
 ) -> SwitchFold:
-    """Where the fold lies in the switch model with a band of half-width v_star > 0.
+    """The fold in the switch model with a band of half-width v_star > 0.
 
-    point: the exact one, from `refine(NonsmoothFold(belt), ...)`, with one stick phase and one slip
-    mode; where: selects its parameter, as for `refine`. `value` is differentiable with respect to
-    v_star. `ValueError` names an impossible argument.
+    `value` is differentiable with respect to v_star.
+
+    Args:
+        point: The exact fold, from `refine(NonsmoothFold(belt), ...)`, with one stick phase and one
+            slip mode.
+        v_star: Half-width of the band.
+        where: Selects its parameter, as for `refine`.
+
+    Returns:
+        The `SwitchFold`.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
     _check(point)
     v_star = as_array(v_star, "v_star")
@@ -73,7 +86,8 @@ def switch_fold(
 def switch_band(
     point: BifurcationPoint, value: ArrayLike, *, where: Callable[[Oscillator], Any]
 ) -> SwitchFold:
-    """The half-width v_star of the band that puts the fold at `value`; else as `switch_fold`."""
+    """The half-width v_star of the band that puts the fold at `value`; otherwise like
+    `switch_fold`."""
     _check(point)
     return _band(point, leaf_index(point.oscillator, where), as_array(value, "value"))
 
@@ -97,7 +111,7 @@ def _check(point):
 
 @jit
 def _fold(point, index, v_star):
-    # From a narrow band, where the asymptotic solution is good, by equal factors to the wanted one.
+    # From a narrow band, where the asymptotic solution is good, by equal factors to the given one.
     bands = FIRST * (v_star / FIRST) ** jnp.linspace(0.0, 1.0, STAGES)
 
     def stage(u, v_star):
@@ -130,10 +144,10 @@ def _where_found(value, v_star, residual) -> SwitchFold:
 
 
 def _equations(point, index: int, u: Array, value: Array, v_star: Array) -> Array:
-    """Four equations for (g, tau, T), in units of what they go to with v_star, and the fourth
-    unknown, whichever it is.
+    """Four equations for (g, tau, T), in units of their limits for small v_star, and the fourth
+    unknown.
 
-    As v_star goes to zero g goes to m v_star. The way in the band is g and, from there, that on
+    As v_star goes to zero g goes to m v_star. The way in the band is g and, from there, the way on
     which the needed force grows from u0 mu(v_star) to u0 mus.
     """
     point = lax.stop_gradient(point)
@@ -151,8 +165,11 @@ def _equations(point, index: int, u: Array, value: Array, v_star: Array) -> Arra
 
 
 def _cycle_equations(point, osc: Oscillator, v_star: Array, unknowns: Array) -> Array:
-    """Slip onset at the end of the band, and the slip phase, followed backwards from where it
-    ends, begins there: what is missing of the force, of x1 and of x2."""
+    """Three equations of a cycle: errors of the force, of x1 and of x2.
+
+    Slip onset at the end of the band, and the slip phase, followed backwards from its end, begins
+    there.
+    """
     gap, tau, duration = unknowns
     k = point.condition.belt
     slip = point.cycle.chain.codes[0]

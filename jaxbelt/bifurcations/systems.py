@@ -1,10 +1,10 @@
 """Systems of equations of a motion and one condition, and Newton's method for them.
 
 A `CycleSystem` has 3N + 1 equations: those of a cycle with a fixed signature, see `cycles`, and a
-condition. A `RestSystem` has k + 1 equations in the k unknowns of a state of rest. With one unknown
-more, a parameter, Newton's method finds a point; with two, they are followed along a curve. What
-both say of a solution they say in `look`: whether it is a motion that exists, and the functions to
-be watched along a curve.
+condition. A `RestSystem` has k + 1 equations in the k unknowns of a state of rest. With one more
+unknown, a parameter, Newton's method finds a point; with two, they are followed along a curve.
+`seen_at` of both judges a solution: whether it is a motion that exists, and the functions to watch
+along a curve.
 """
 
 import abc
@@ -29,31 +29,32 @@ from ..model.oscillator import Oscillator
 from ..model.variations import Family
 from ..motion.arcs import Ends
 from ..numerics.newton import HOLDS, STEP_ROUNDING, Equations, is_settled, newton, solve
+from ..numerics.padding import longer
 from ..results import Status
 
-#: Unknowns of a cycle count this much in the length of a step along a curve, beside the two
-#: parameters; large ones less, for durations of stick phases go to infinity where a belt comes to
-#: rest. Of seven curves of class (b) one ends too early with a tenth of it; with three times as
-#: much they take half as many points again.
+#: Weight of the unknowns of a cycle in the length of a step along a curve, beside the two
+#: parameters; large unknowns count less, as durations of stick phases go to infinity where a belt
+#: comes to rest. Of seven curves of class (b) one ends too early with a tenth of it; with three
+#: times as much they take half as many points again.
 WEIGHT = 0.1
 #: A point is determined where its error, in units of the parameter, is smaller: at a double root it
 #: is some 1e-7, and where the equations hold all along the parameter 1 and more.
 DETERMINED = 1e-3
 #: The integration steps of an arc are cut into so many parts if they leave a larger error in its
-#: equations, relative to the motion: beside a slow belt and under a steep law 1e-8 was seen, which
-#: moved the point by 1e-6, and 1e-15 with the parts.
+#: equations, relative to the motion: beside a slow belt and under a steep law the error was 1e-8,
+#: which moved the point by 1e-6, and 1e-15 with the parts.
 PARTS_OF_ARC, EXACT_ARC = 8, 1e-13
-#: The place of nothing.
+#: The place where there is no motion.
 NOWHERE = np.full(5, np.nan)
-#: Functions by what it means that one vanishes: the name of a special point, the belts concerned.
+#: Functions, by the name of the special point at which each one vanishes and the belts concerned.
 Tests = dict[tuple[str, tuple[int, ...]], Any]
 
 
 class Seen(NamedTuple):
     """What is seen at a point of a curve.
 
-    tests: functions to watch; exists: whether there is such a motion; multiplier: of the cycle, NaN
-    where none is told; residual: the largest error in all equations.
+    tests: functions to watch; exists: whether there is such a motion; multiplier: of the cycle, or
+    NaN; residual: the largest error in all equations.
     """
 
     tests: Tests
@@ -63,7 +64,7 @@ class Seen(NamedTuple):
 
 
 class AbstractSystem(eqx.Module):
-    """Equations in the unknowns of a motion, one more than these."""
+    """Equations in the unknowns of a motion, one more than there are unknowns."""
 
     @abc.abstractmethod
     def residual(self, osc: Oscillator, x: Array) -> Array:
@@ -76,12 +77,12 @@ class AbstractSystem(eqx.Module):
         """The residual at the parameters p, [k], and its Jacobian with respect to (x, p)."""
 
     @abc.abstractmethod
-    def look(self, osc: Oscillator, x: Array) -> Seen:
+    def seen_at(self, osc: Oscillator, x: Array) -> Seen:
         """What is seen at a solution x."""
 
     @abc.abstractmethod
     def place(self, x: np.ndarray) -> np.ndarray:
-        """Where the motion is, as `attractors.place_of`; NaN where that is not to be compared."""
+        """Place of the motion, as `attractors.place_of`; NaN where it is not to be compared."""
 
     @abc.abstractmethod
     def shaped(self, x: Array) -> Array:
@@ -89,11 +90,11 @@ class AbstractSystem(eqx.Module):
 
     @abc.abstractmethod
     def weights(self, x: Array) -> Array:
-        """How much each unknown counts in the length of a step along a curve."""
+        """Weight of each unknown in the length of a step along a curve."""
 
     @abc.abstractmethod
     def remeshed(self, osc: Oscillator, x: Array) -> "AbstractSystem":
-        """The same with the steps of integration spread anew, where there are any."""
+        """The same system with new integration steps, where there are any."""
 
 
 def velocity_of(osc: Oscillator, belt: int | Array) -> Array:
@@ -126,11 +127,11 @@ class RestSystem(AbstractSystem):
         """Whether a solution is such a state."""
 
     def tests(self, osc: Oscillator, x: Array) -> Tests:
-        """What to watch along its curve."""
+        """Functions to watch along its curve."""
         return {}
 
     def x1(self, osc: Oscillator, x: Array) -> Array:
-        """Where the mass rests, NaN where that is not known."""
+        """Displacement of the mass at rest, NaN where it is not known."""
         return x[0] if x.size else jnp.asarray(jnp.nan)
 
     def linearized(self, osc_of, x, p):
@@ -140,7 +141,7 @@ class RestSystem(AbstractSystem):
         u = jnp.append(x, p)
         return value(u), jax.jacfwd(value)(u)
 
-    def look(self, osc, x):
+    def seen_at(self, osc, x):
         tests = {**velocity_tests(osc), **self.tests(osc, x)}
         error = jnp.max(jnp.abs(self.residual(osc, x)))
         return Seen(tests, self.exists(osc, x), jnp.asarray(jnp.nan), error)
@@ -162,7 +163,7 @@ class RestSystem(AbstractSystem):
 
 
 def third_derivative(osc: Oscillator, codes: Array, x1: Array) -> Array:
-    """That of x2' by x2 at a fixed point: 16 times the first Lyapunov coefficient."""
+    """Third derivative of x2' by x2 at a fixed point: 16 times the first Lyapunov coefficient."""
 
     def derivative(fn):
         return lambda x2: jax.jvp(fn, (x2,), (jnp.ones_like(x2),))[1]
@@ -180,15 +181,16 @@ class CycleSystem(AbstractSystem):
 
     @abc.abstractmethod
     def condition(self, osc: Oscillator, z: Array, miss: Array) -> Array:
-        """What vanishes there; miss: that of the tangent arcs, see `cycles.residual`."""
+        """The expression that vanishes; miss: error of the tangent arcs, see `cycles.residual`."""
 
     def judge(self, osc: Oscillator, z: Array, cycle: Cycle, slope: Array) -> tuple[Array, Array]:
-        """The status of a solution and the multiplier to be told; slope: with stick phases left
-        out."""
+        """Status of a solution, and the multiplier to report; slope: multiplier without stick
+        phases."""
         return cycle.status, jnp.asarray(jnp.nan)
 
     def watch(self, osc: Oscillator, z: Array, slope: Array) -> tuple[Tests, Any, Any]:
-        """What to watch along its curve, whether the solution is meant, its multiplier to tell."""
+        """Functions to watch along its curve, whether the solution counts, and the multiplier to
+        report."""
         return {}, True, jnp.nan
 
     def residual(self, osc, x):
@@ -224,7 +226,7 @@ class CycleSystem(AbstractSystem):
         ends = jnp.where(self.chain.ends >= tangent, self.chain.ends - tangent, self.chain.ends)
         return Chain(self.chain.codes, ends, self.chain.mesh)
 
-    def look(self, osc, x):
+    def seen_at(self, osc, x):
         ok, error = jnp.asarray(Status.OK.value), jnp.max(jnp.abs(self.residual(osc, x)))
         cycle, slope = cycle_of(osc, self.ordinary, x, jnp.asarray(0), ok, error)
         tests, is_meant, multiplier = self.watch(osc, x, slope)
@@ -245,23 +247,27 @@ class CycleSystem(AbstractSystem):
         return eqx.tree_at(lambda system: system.chain, self, meshed(osc, loop)[0]).refined(osc, x)
 
     def refined(self, osc: Oscillator, x: Array) -> "CycleSystem":
-        """The same with shorter integration steps on arcs that need them, by the error that their
-        steps leave in the equations at x; steps of length zero pad the others."""
+        """The same system with shorter integration steps on arcs that need them.
+
+        The error of the steps in the equations at x decides; steps of length zero pad the other
+        arcs.
+        """
         chain = self.chain
         values, misses = on_both_meshes(self, lambda one: residual(osc, one.chain, x))
         error = jnp.max(jnp.abs(values[0] - values[1]), axis=-1)
         is_tangent = chain.ends >= Ends(chain.codes.shape[-1]).tangent
         error = jnp.where(is_tangent, jnp.maximum(error, jnp.abs(misses[0] - misses[1])), error)
-        mesh, others = chain.mesh, (PARTS_OF_ARC - 1) * chain.mesh.shape[-1]
+        mesh = chain.mesh
         fine = jnp.repeat(mesh / PARTS_OF_ARC, PARTS_OF_ARC, axis=-1)
-        coarse = jnp.pad(mesh, [(0, 0), (0, others)])
+        coarse = longer(mesh, fine.shape[-1], axis=-1, fill=0.0)
         is_exact = error < EXACT_ARC * (1 + jnp.max(jnp.abs(x[:, :2])))
         mesh = jnp.where(is_exact[:, None], coarse, fine)
         return eqx.tree_at(lambda system: system.chain.mesh, self, lax.stop_gradient(mesh))
 
 
 def stick_phase_from(osc: Oscillator, chain: Chain, row: Array) -> Array:
-    """A row, and the arcs after it in the stick phase that it begins: one that passes edges."""
+    """The arc `row` and the arcs after it in the stick phase that it begins (one that passes
+    edges)."""
     stuck = chain.used & jnp.any(chain.codes == 0, axis=-1)
     rows = jnp.arange(stuck.size)
     before = (rows - 1) % jnp.maximum(jnp.sum(chain.used), 1)
@@ -274,13 +280,13 @@ def stick_phase_from(osc: Oscillator, chain: Chain, row: Array) -> Array:
 def nearest_contacts(
     osc: Oscillator, chain: Chain, z: Array, sticks: Array, without: bool | Array = False
 ) -> tuple[Array, Array]:
-    """How near a cycle is to another signature at each belt, and whether it sticks there, [belts].
+    """Distance of a cycle from another signature at each belt, and whether it sticks there,
+    [belts].
 
-    The shortest of its stick phases, among the arcs `sticks`; where there is none, the distance of
-    its nearest extremum of x2 from the boundary. Or, if less, that of x2 from the boundary where
-    the cycle passes a contact edge slipping, as it meets both at once then. inf where there is
-    nothing of these. without: at the ends of which arcs, where they pass an edge, which belts are
-    not asked, [arcs, belts].
+    The shortest of its stick phases, among the arcs `sticks`; if there is none, the distance of its
+    nearest extremum of x2 from the boundary. Or, if less, that of x2 from the boundary where the
+    cycle passes a contact edge slipping, as it meets both at once then. inf where none of these
+    exists. without: belts that are ignored where arcs pass an edge, [arcs, belts].
     """
     n, without = len(osc.belts), jnp.broadcast_to(without, chain.codes.shape)
     following = jnp.roll(z, -1, axis=0)
@@ -315,16 +321,18 @@ def _is_within(osc: Oscillator, codes: Array, x1: Array) -> Array:
 
 
 def contact_tests(name: str, nearest: Array, watched: Array) -> Tests:
-    """Those distances of the belts that are watched, under a name."""
+    """These distances for the watched belts, under a name."""
     known = jnp.where(watched & jnp.isfinite(nearest), nearest, jnp.nan)
     return {(name, (belt,)): known[belt] for belt in range(nearest.size)}
 
 
 def nearest_edge(osc: Oscillator, chain: Chain, z: Array, without: bool | Array = False) -> Array:
-    """How near a cycle is to passing a contact edge otherwise, NaN where there is none: the least
-    distance of an extremum of x1, of a place where it is tangent to a boundary, or of a slip onset,
-    from an edge of its mode; or by how much the force exceeds what would hold the mass where an
-    edge tears it off. without: arcs whose ends are not asked, [arcs]."""
+    """Distance of a cycle from a change at a contact edge, NaN where there is none.
+
+    The least distance of an extremum of x1, of a tangency to a boundary, or of a slip onset, from
+    an edge of its mode; or the excess of the force over the holding force where an edge tears the
+    mass off. without: arcs whose ends are ignored, [arcs].
+    """
     n = chain.codes.shape[-1]
     kinds = Ends(n)
     following = jnp.roll(z, -1, axis=0)
@@ -333,12 +341,12 @@ def nearest_edge(osc: Oscillator, chain: Chain, z: Array, without: bool | Array 
 
     def distance(codes, end, after, y):
         gap = jnp.min(jnp.stack(edge_guards(osc, mode_of(codes), y[0])))
-        told = (end == kinds.extremum_x1) | (end == kinds.onset) | (end >= kinds.tangent)
+        relevant = (end == kinds.extremum_x1) | (end == kinds.onset) | (end >= kinds.tangent)
         torn = (codes == 0) & (jnp.abs(after) == 1) & (end >= n) & (end < 3 * n)
         held = mode_of(jnp.where(torn, 0.0, after))
         excess = jnp.abs(mode_acceleration(osc, held, y[0], y[1])) - capacity(osc, held)
         tears = jnp.any(torn) & jnp.all(after != 0)
-        return jnp.where(told, gap, jnp.where(tears, excess, jnp.inf))
+        return jnp.where(relevant, gap, jnp.where(tears, excess, jnp.inf))
 
     columns = chain.codes, chain.ends, following_codes(chain), following
     asked = chain.used & ~jnp.asarray(without)
@@ -363,11 +371,11 @@ class _InParameter(Equations):
 
 
 class Solution(NamedTuple):
-    """What Newton's method finds of a system, near a guess.
+    """A solution of a system near a guess, by Newton's method.
 
-    z, p: unknowns and parameter, [1]; steps: how far each step went, NaN padded; iterations: how
-    many there were; residual: the largest error in the equations; error: a bound on that of p;
-    status: that of the guess, where it was not OK, or whether the steps converged.
+    z, p: unknowns and parameter, [1]; steps: length of each step, NaN padded; iterations: their
+    number; residual: the largest error in the equations; error: a bound on that of p; status: that
+    of the guess, where it was not OK, or whether the steps converged.
     """
 
     z: Array
@@ -397,11 +405,13 @@ def solve_system(family: Family, system: CycleSystem, z0, p0, status: Array) -> 
 
 
 def _accuracy(osc: Oscillator, system: CycleSystem, z: Array, matrix: Array):
-    """The residual, and a bound on the error of p, in its units: what the residual with halved
-    steps and rounding do to it."""
+    """The residual, and a bound on the error of p, in its units.
+
+    The bound is the effect of the residual with halved steps, and of rounding.
+    """
     values = on_both_meshes(system, lambda one: one.residual(osc, z))
     weights = jnp.linalg.solve(matrix.T, jnp.zeros(values.shape[1]).at[-1].set(1.0))
-    # Of states; what rounding does to a duration, however long, the velocity undoes.
+    # Rounding of states; for durations, however long, the velocity cancels it.
     rounding = 1e-15 * (1 + jnp.max(jnp.abs(z[:, :2]))) * jnp.sum(jnp.abs(weights))
     return jnp.max(jnp.abs(values[0])), 2 * jnp.abs(jnp.sum(weights * values[1])) + rounding
 
@@ -417,8 +427,10 @@ def on_both_meshes(system: CycleSystem, value: Callable[[CycleSystem], Any]) -> 
 
 
 def judged_by(error: Array, family: Family, status: Array) -> Array:
-    """The status of a point with that error of its parameter: DEGENERATE in place of OK where the
-    equations hold, and do not tell the parameter."""
+    """The status of a point with that error of its parameter.
+
+    DEGENERATE in place of OK where the equations hold and do not determine the parameter.
+    """
     fails = (status == Status.OK) & ~(error < DETERMINED * family.unit)
     return jnp.where(fails, Status.DEGENERATE.value, status)
 
@@ -452,14 +464,17 @@ def small_newton(equations, osc, unknowns, unit: Any = 1.0):
 
 
 def _rounding(u: Array, matrix: Array) -> Array:
-    """What rounding does to the last of the unknowns."""
+    """Effect of rounding on the last of the unknowns."""
     weights = jnp.linalg.solve(matrix.T, jnp.zeros(u.size).at[-1].set(1.0))
     return 1e-15 * (1 + jnp.max(jnp.abs(u))) * jnp.sum(jnp.abs(weights))
 
 
 def _determined(u: Array, value: Array, matrix: Array) -> tuple[Array, Array]:
-    """Equations of which the next Newton step leaves the parameter as it is where they hold and do
-    not tell it."""
+    """Equations whose next Newton step leaves the parameter unchanged where they do not determine
+    it.
+
+    That is where they hold and the matrix is singular.
+    """
     fails = ~(_rounding(u, matrix) < DETERMINED) & jnp.all(jnp.abs(value) < HOLDS)
     own = matrix.at[:, -1].set(0.0)
     normal = own.T @ own + 1e-14 * jnp.maximum(jnp.sum(own**2), 1.0) * jnp.eye(u.size)

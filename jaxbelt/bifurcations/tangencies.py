@@ -1,16 +1,16 @@
 """Cycles tangent to the boundary of a belt: `NonsmoothFold` and `GrazingSliding`.
 
 The arc before the stick phase meets the boundary tangentially, r = 0 and x2' = 0, which for a law
-without a jump is the very point of slip onset. That arc is followed backwards from the point of
-tangency, so trial solutions cannot overshoot, and that it meets its entry is one equation more.
-Both kinds are this same event. What tells them apart is the multiplier m of the cycle at the point
-with that stick arc left out. The return map has slope 0 where the cycle sticks and slope m where it
-does not: for m > 1 both its fixed points lie on one side and vanish together (fold); for m < 1, one
-lies on either side, and the cycle goes on (grazing). A cycle with another stick phase has m = 0.
-Where the law jumps, static > mu(0+), the stick phase that begins at the tangency lasts, and without
-it the orbit is another one: the return map jumps, m = inf, and the cycle ends there.
+without a jump is the point of slip onset. That arc is followed backwards from the point of
+tangency, so trial solutions cannot overshoot; that it meets its entry is one more equation. Both
+kinds are this same event. They differ in the multiplier m of the cycle at the point with that stick
+arc left out. The return map has slope 0 where the cycle sticks and slope m where it does not: for m
+> 1 both its fixed points lie on one side and vanish together (fold); for m < 1, one lies on either
+side, and the cycle continues (grazing). A cycle with another stick phase has m = 0. Where the law
+jumps, static > mu(0+), the stick phase that begins at the tangency has a positive duration, and
+without it the orbit is another one: the return map jumps, m = inf, and the cycle ends there.
 
-With a nonsmooth fold the paper's cycles end (its section 3); grazing-sliding is the name of M. di
+The paper's cycles end with a nonsmooth fold (its section 3); grazing-sliding is the name of M. di
 Bernardo, C. Budd, A. Champneys, P. Kowalczyk, Piecewise-smooth Dynamical Systems, 2008.
 """
 
@@ -47,16 +47,17 @@ from .systems import (
     velocity_of,
 )
 
-#: How far from an equilibrium its unstable manifold begins to be followed: the error is some third
-#: power of it over the velocity at which the friction law bends, 1/p3 for Conti's law. With 1e-4
-#: the limit of class (b) at nu1 = -0.2839 is off by 5e-12, with 1e-5 by no more than 1e-14.
+#: Distance from an equilibrium at which its unstable manifold begins to be followed: the error is
+#: about the third power of it over the velocity at which the friction law bends, 1/p3 for Conti's
+#: law. With 1e-4 the limit of class (b) at nu1 = -0.2839 is off by 5e-12, with 1e-5 by no more than
+#: 1e-14.
 DEPARTURE = 1e-5
 #: Integration steps for each arc of that orbit; it takes long to leave.
 DEPARTURE_STEPS = 48
 
 
 class Encounter(CycleSystem):
-    """Two belts run at one velocity; if they are the same, an arc is tangent to its boundary.
+    """Two belts have one velocity; if they are the same belt, an arc is tangent to its boundary.
 
     row: of the stick phase that begins at the tangency, else -1; wanted: see `AbstractTangency`.
     """
@@ -84,7 +85,8 @@ class Encounter(CycleSystem):
         slope = jnp.where(z[self.row, 2] > 1e-6, jnp.inf, slope)  # sqrt(rounding) is no phase
         slope = jnp.where(jnp.any(self._other_phases(osc)), 0.0, slope)
         # A tangency is of one kind.
-        is_wanted = (self.wanted == 0) | (self.wanted * (slope - 1) >= 0)  # it may be infinite
+        # the slope may be infinite
+        is_wanted = (self.wanted == 0) | (self.wanted * (slope - 1) >= 0)
         fits = ~self.is_tangency | is_wanted
         other_kind = (cycle.status == Status.OK) & ~fits
         status = jnp.where(other_kind, Status.OTHER_KIND.value, cycle.status)
@@ -94,7 +96,7 @@ class Encounter(CycleSystem):
         sticks = self._other_phases(osc)
         slope = jnp.where(jnp.any(sticks), 0.0, slope)
         nearest, stuck = nearest_contacts(osc, self.chain, z, sticks)
-        # An exchange ends where the phase of sticking vanishes.
+        # An exchange ends where the stick phase vanishes.
         tests = contact_tests("DoubleSliding", nearest, stuck | self.is_tangency)
         alone = self.is_tangency & ~jnp.any(sticks)
         tests["FoldGrazing", ()] = jnp.where(alone, slope - 1, jnp.nan)
@@ -108,14 +110,14 @@ class AbstractTangency(AbstractStickCondition):
     wanted: 1 a fold, -1 grazing, 0 either.
     """
 
-    family: ClassVar[str] = "tangency"
+    group: ClassVar[str] = "tangency"
     more_arcs: ClassVar[int] = 1
     bends: ClassVar[bool] = True
 
     @property
     @abc.abstractmethod
     def wanted(self) -> float | Array:
-        """Which of the two kinds is meant."""
+        """The kind to solve for: see the class."""
 
     @property
     def sought(self):
@@ -137,7 +139,7 @@ class AbstractTangency(AbstractStickCondition):
         return _nearly_closed(osc, orbit, self.belt, size)
 
     def system(self, osc, loop, status):
-        fits = jnp.sum(loop.used) < loop.ends.size  # it may need one arc more
+        fits = jnp.sum(loop.used) < loop.ends.size  # it may need one more arc
         status = jnp.where(fits | (status != Status.OK), status, Status.TOO_MANY_ARCS.value)
         loop, row, found = _with_stick(osc, loop, self.belt)
         chain, z = meshed(osc, loop)
@@ -153,7 +155,7 @@ class AbstractTangency(AbstractStickCondition):
         return [None, *(one.loop for one in cycles)]
 
     def limit(self, trail):
-        """Where the curve ends at a belt at rest.
+        """The end of the curve at a belt at rest.
 
         No cycle exists in the limit: slip onset on the belt meets an equilibrium, which the orbit
         takes ever longer to leave. Of its two unstable directions the stronger one wins, by the
@@ -175,15 +177,15 @@ class AbstractTangency(AbstractStickCondition):
             return (p, residual), (p,)
 
         still = trail.variation.held(held, stopping.value)
-        ((value,), residual), settled = still.settle(attempt, (np.array([guess]),))
-        if not (settled and residual < HOLDS and abs(value - guess) < 3 * trail.step):
+        ((value,), residual), agrees = still.relinearised(attempt, (np.array([guess]),))
+        if not (agrees and residual < HOLDS and abs(value - guess) < 3 * trail.step):
             return None
         values = (float(value), stopping.value) if held else (stopping.value, float(value))
         return SpecialPoint("BeltAtRest", (stopping.belt,), values, float(residual))
 
 
 class Tangency(AbstractTangency):
-    """A tangency of whichever kind, and what programs know of both."""
+    """A tangency of either kind, as data for programs."""
 
     meant: float | Array = 0.0
 
@@ -193,7 +195,11 @@ class Tangency(AbstractTangency):
 
 
 class NonsmoothFold(AbstractTangency):
-    """The stick phase on a belt shrinks to a point and the cycle vanishes with an unstable one."""
+    """The stick phase on a belt shrinks to a point and the cycle vanishes with an unstable one.
+
+    Args:
+        belt: Number of the belt.
+    """
 
     caption: ClassVar[str] = "nonsmooth fold, belt {belt}"
     line: ClassVar[Line] = Line("nonsmooth fold", "black")
@@ -204,7 +210,11 @@ class NonsmoothFold(AbstractTangency):
 
 
 class GrazingSliding(AbstractTangency):
-    """The cycle touches the boundary of a belt and begins to stick to it there, but goes on."""
+    """The cycle touches the boundary of a belt and begins to stick to it there, but continues.
+
+    Args:
+        belt: Number of the belt.
+    """
 
     caption: ClassVar[str] = "grazing, belt {belt}"
     line: ClassVar[Line] = Line("grazing", "#CC79A7")
@@ -218,7 +228,7 @@ class GrazingSliding(AbstractTangency):
 
     @classmethod
     def between(cls, before, after, edged):
-        # Whether a tangency is a fold or grazing is seen when it is found.
+        # Whether a tangency is a fold or grazing shows at the solution.
         one, other = (label.events(EventKind.STICK) for label in (before, after))
         return [cls(belt) for belt in (one - other) + (other - one)]
 
@@ -231,10 +241,10 @@ TimedGrazing.public = GrazingSliding
 
 @jit
 def _nearly_closed(osc: Oscillator, orbit: Orbit, belt: Array, size: int) -> tuple[Loop, Array]:
-    """A loop that is nearly the cycle, from the orbit after a stick phase, and a status.
+    """A loop near the cycle, from the orbit after a stick phase, and a status.
 
-    Either a cycle was found, or the orbit left the boundary for good: then its first loop from
-    slip onset to the next extremum of x2 on that side, closed there, is nearly the cycle.
+    Either a cycle was found, or the orbit left the boundary for good: then its first loop from slip
+    onset to the next extremum of x2 on that side, closed there, is near the cycle.
     """
     n = len(osc.belts)
     velocity = velocity_of(osc, belt)
@@ -258,10 +268,10 @@ def _nearly_closed(osc: Oscillator, orbit: Orbit, belt: Array, size: int) -> tup
 
 
 def _with_stick(osc: Oscillator, loop: Loop, belt: int | Array) -> tuple[Loop, Array, Array]:
-    """A loop with a stick arc on the belt, its row, whether there is one.
+    """A loop with a stick arc on the belt, its row, and whether there is one.
 
-    Its own that begins most nearly by a tangency, or one of duration zero where x2 comes closest to
-    the boundary from inside.
+    The loop's own stick arc that begins most nearly by a tangency, or one of duration zero where x2
+    comes closest to the boundary from inside.
     """
     velocity = velocity_of(osc, belt)
     rows = jnp.arange(loop.ends.size)
@@ -282,7 +292,7 @@ def _with_stick(osc: Oscillator, loop: Loop, belt: int | Array) -> tuple[Loop, A
         after = (rows > at + 1).reshape(-1, *[1] * (array.ndim - 1))
         return jnp.where(after, shifted, array).at[at + 1].set(new)
 
-    # Where all rows are in use the last one is shifted out; the caller knows.
+    # Where all rows are in use the last one is shifted out; the caller checks that.
     new = Loop(
         codes=inserted(loop.codes, loop.codes[at].at[belt].set(STUCK)),
         ends=inserted(loop.ends.at[at].set(belt), jnp.asarray(names.onset)),
@@ -300,8 +310,8 @@ def _with_stick(osc: Oscillator, loop: Loop, belt: int | Array) -> tuple[Loop, A
 def _tangent_departure(family: Family, codes, resting, touched, guess: Array):
     """Value of a parameter for which the orbit from `_departure` is tangent to another boundary.
 
-    The 3N + 1 equations of an `Encounter`, but that the orbit is not closed: it begins on the
-    unstable manifold. Returns the residual, too, with every integration step halved; nan where
+    The 3N + 1 equations of an `Encounter`, except that the orbit is not closed: it begins on the
+    unstable manifold. Returns the residual, too, with every integration step halved; NaN where
     there is no such orbit.
     """
     osc_at, osc = family.at, family.at(guess)
@@ -325,7 +335,7 @@ def _tangent_departure(family: Family, codes, resting, touched, guess: Array):
         belts, either = jnp.stack([touched, touched]), jnp.zeros(())
         return Encounter(chain, belts, jnp.asarray(-1), either)
 
-    closing = 3 * rows[-1] + jnp.arange(2)  # replaced by where the orbit begins
+    closing = 3 * rows[-1] + jnp.arange(2)  # replaced by the beginning of the orbit
 
     def begins(z, p):
         return z[0, :2] - _departure(osc_at(p), codes, resting)

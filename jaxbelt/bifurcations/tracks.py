@@ -1,8 +1,8 @@
 """The system of equations along a curve of bifurcation points, and the special points on its way.
 
 A `Track` is the system of a condition with both parameters among its unknowns. Between two points
-of it the functions that are watched may change their signs: where one does, `special_between`
-solves for its zero, a point of codimension two.
+of it the watched functions may change their signs: where one does, `special_between` solves for its
+zero, a point of codimension two.
 """
 
 from collections.abc import Callable
@@ -21,12 +21,12 @@ from .special import SpecialPoint
 from .systems import AbstractSystem, Seen
 
 #: How often, at most, the points on both sides of a singular one are brought nearer to it by half.
-#: Newton's method fails before: after four times in the cases known, where twice leave 5e-9.
+#: Newton's method fails earlier: after four times in the known cases, where two times leave 5e-9.
 SHRINKS = 8
 #: A watched function that is larger than this fraction of its values before and after where it
 #: changes its sign jumps there, and does not vanish. Zeros of square roots leave 1e-7.
 JUMPS = 1e-3
-#: One that is smaller at both ends of a step is zero all along it, to rounding.
+#: A function that is smaller at both ends of a step is zero all along it, up to rounding.
 ALONG = 1e-12
 
 
@@ -41,11 +41,11 @@ class Track(NamedTuple):
     def begun(
         cls, variation: Variation, point: BifurcationPoint, pair: np.ndarray
     ) -> tuple["Track", np.ndarray]:
-        """The system that is followed from a point, and u there; pair: both parameters."""
+        """The system to follow from a point, and u there; pair: both parameters."""
         condition = point.condition
         if has_clock(point.oscillator):
             condition = condition.with_clock()
-        system, x = condition.followed(point)
+        system, x = condition.system_at(point)
         weights = system.weights(jnp.asarray(x))
         u = np.append(np.asarray(weights) * np.asarray(x).reshape(-1), pair)
         return cls(variation, system, weights), u
@@ -61,18 +61,20 @@ class Track(NamedTuple):
             solved = corrected(_curve_linearized, args, unknowns[0], normal, ahead)
             return solved, (solved.u, solved.u[-2:])
 
-        solved, settled = self.variation.settle(attempt, (start, (start + length * normal)[-2:]))
-        return solved._replace(found=solved.found & settled)
+        solved, agrees = self.variation.relinearised(
+            attempt, (start, (start + length * normal)[-2:])
+        )
+        return solved._replace(found=solved.found & agrees)
 
     def unknowns(self, u: np.ndarray) -> np.ndarray:
-        """Those of the system."""
+        """The unknowns of the system."""
         return np.asarray(self.system.shaped(jnp.asarray(u[:-2] / np.asarray(self.weights))))
 
     def place(self, u: np.ndarray) -> np.ndarray:
-        """Where the motion is, see `place_of`."""
+        """Place of the motion, see `place_of`."""
         return self.system.place(self.unknowns(u))
 
-    def look(self, u: np.ndarray) -> Seen:
+    def seen_at(self, u: np.ndarray) -> Seen:
         """What is seen at a solution, in numbers."""
         osc, x = self.variation.oscillator(u[-2:]), jnp.asarray(self.unknowns(u))
         seen = _seen_at(osc, self.system, x)
@@ -80,17 +82,17 @@ class Track(NamedTuple):
         return Seen(tests, bool(seen.exists), float(seen.multiplier), float(seen.residual))
 
     def remeshed(self, u: np.ndarray, tangent: np.ndarray) -> tuple["Track", Any, Any]:
-        """The same with the steps of integration spread anew, and u and the tangent in it."""
+        """The same track with new integration steps, and u and the tangent in it."""
         osc, x = self.variation.oscillator(u[-2:]), jnp.asarray(self.unknowns(u))
         system, weights = _remeshed(osc, self.system, x)
         scale = np.append(np.asarray(weights) / np.asarray(self.weights), [1.0, 1.0])
         return Track(self.variation, system, weights), scale * u, scale * tangent
 
     def tangent(self, u: np.ndarray) -> np.ndarray:
-        """The direction of the curve at u, in the sense in which a parameter grows."""
+        """Direction of the curve at u, in the sense in which a parameter grows."""
         for axis in (-2, -1):
             solved = self.corrected(u, np.eye(u.size)[axis], 0.0)
-            if solved.found:  # it is not where the curve turns back in this parameter
+            if solved.found:  # not found where the curve turns back in this parameter
                 break
         return solved.tangent
 
@@ -103,7 +105,7 @@ def _curve_linearized(u: Array, args: tuple[Family, AbstractSystem, Array]) -> t
 
 @jit
 def _seen_at(osc: Oscillator, system: AbstractSystem, x: Array) -> Seen:
-    return system.look(osc, x)
+    return system.seen_at(osc, x)
 
 
 @jit
@@ -120,7 +122,7 @@ def special_between(
     before: tuple[CurvePoint, Seen],
     after: tuple[CurvePoint, Seen],
 ) -> list[SpecialPoint]:
-    """The points of codimension two between two neighbours: where a watched function vanishes."""
+    """Points of codimension two between two neighbours: zeros of watched functions."""
     from scipy.optimize import brentq  # half a second that only curves need
 
     (a, seen_a), (b, seen_b) = before, after
@@ -133,14 +135,14 @@ def special_between(
 
         def probe(part, name=name):
             at = track.corrected(a.u, a.tangent, part * length)
-            seen = track.look(at.u)
+            seen = track.seen_at(at.u)
             value = seen.tests[name]
             if not at.found or np.isnan(value):
                 raise _SingularError
             return _Probe(part, value, at.u[-2:], max(seen.residual, abs(value)))
 
         try:
-            # Beside a singular point what is solved for anew at an end may be on the other side.
+            # Beside a singular point the solution at an end may be on the other side.
             if probe(0.0).test * probe(1.0).test > 0:
                 raise _SingularError
             root: Any = brentq(lambda part, probe=probe: probe(part).test, 0.0, 1.0, xtol=1e-14)
@@ -159,8 +161,10 @@ def special_between(
 
 
 def _vanishes_at_rest(point: SpecialPoint, points: list[SpecialPoint]) -> bool:
-    """Whether it is where a belt comes to rest, one of these points, as far as that is known:
-    distances of a cycle from others vanish with its velocity."""
+    """Whether a point is one of these points where a belt comes to rest.
+
+    Distances of a cycle from others vanish with the belt's velocity.
+    """
     if point.kind not in ("DoubleSliding", "EdgeTouch"):
         return False
     at_rest = [one for one in points if one.kind == "BeltAtRest"]
@@ -168,7 +172,7 @@ def _vanishes_at_rest(point: SpecialPoint, points: list[SpecialPoint]) -> bool:
 
 
 class _Probe(NamedTuple):
-    """A part of a step, the watched function and the parameters there, the largest error."""
+    """A part of a step, with the watched function, the parameters and the largest error there."""
 
     part: float
     test: float
@@ -177,13 +181,13 @@ class _Probe(NamedTuple):
 
 
 class _SingularError(Exception):
-    """Newton's method does not converge there, or the watched function is not defined."""
+    """Newton's method does not converge, or the watched function is not defined."""
 
 
 def _from_both_sides(probe: Callable[[float], _Probe], low: _Probe, high: _Probe) -> _Probe:
-    """Where a function vanishes that has no value there: extrapolated from what has on both sides.
+    """Zero of a function that has no value there: extrapolated from values on both sides.
 
-    So it is where the cycle of a curve shrinks to a point: with all arcs of duration zero its
+    An example is a curve whose cycle shrinks to a point: with all arcs of duration zero its
     equations are singular.
     """
     from scipy.interpolate import KroghInterpolator

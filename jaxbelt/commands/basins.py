@@ -9,20 +9,14 @@ import typer
 import jaxbelt as jb
 
 from .options import (
-    Belts,
-    Class,
-    Damping,
+    Description,
+    Interval,
     Json,
-    Nu0,
-    Nu1,
-    Omega,
-    Sigma,
-    Sigma0,
-    Sigma1,
-    check_description,
+    Out,
     check_range,
+    describes,
+    from_to,
     make_console,
-    oscillator,
     outputs,
     plain_errors,
     say,
@@ -30,22 +24,11 @@ from .options import (
 )
 
 
+@describes()
 def basins(
-    system: Class = "b",
-    nu0: Nu0 = None,
-    nu1: Nu1 = None,
-    sigma: Sigma = None,
-    sigma0: Sigma0 = None,
-    sigma1: Sigma1 = None,
-    belt: Belts = None,
-    damping: Damping = 0.5,
-    omega: Omega = 1.0,
-    x1: Annotated[
-        tuple[float, float], typer.Option(metavar="FROM TO", help="Displacements of the starts.")
-    ] = (0.0, 3.0),
-    x2: Annotated[
-        tuple[float, float], typer.Option(metavar="FROM TO", help="Velocities of the starts.")
-    ] = (-1.0, 1.0),
+    described: Description,
+    x1: Annotated[Interval, from_to("Displacements of the starts.")] = (0.0, 3.0),
+    x2: Annotated[Interval, from_to("Velocities of the starts.")] = (-1.0, 1.0),
     points: Annotated[
         int, typer.Option(help="Starts along each side of the grid; their square is run.")
     ] = 201,
@@ -53,13 +36,7 @@ def basins(
         int, typer.Option(help="Random starts for the basin stability of the window; 0: none.")
     ] = 10_000,
     seed: Annotated[int, typer.Option(help="Of the random starts.")] = 0,
-    out: Annotated[
-        Path,
-        typer.Option(
-            help="Where to write, without an ending: OUT.png, OUT.csv, ... Folders that are "
-            "missing are made."
-        ),
-    ] = Path("basins"),
+    out: Out = Path("basins"),
     as_json: Json = False,
 ) -> None:
     """Where each start leads: basins of attraction, and the unstable cycle between them.
@@ -91,10 +68,9 @@ def basins(
         check_range("x1", x1)
         check_range("x2", x2)
         written = outputs(out, ".png", ".csv", ".nc")
-        arguments = {"nu0": nu0, "nu1": nu1, "sigma": sigma, "sigma0": sigma0, "sigma1": sigma1}
-        check_description(system, arguments, belt)
+        described.check()
         turn_on_float64()
-        osc = oscillator(system, belt, damping, omega, **arguments)
+        osc = described.oscillator()
         import jax
         import numpy as np
 

@@ -11,25 +11,17 @@ import jaxbelt as jb
 
 from ..spelling import did_you_mean
 from .options import (
-    CLASSES,
-    Belts,
-    Class,
-    Damping,
+    Description,
+    Interval,
     Json,
-    Nu0,
-    Nu1,
-    Omega,
-    Sigma,
-    Sigma0,
-    Sigma1,
+    Out,
     as_json_value,
-    check_description,
     check_range,
+    describes,
+    from_to,
     make_console,
     names_in_words,
-    oscillator,
     outputs,
-    parameters,
     plain_errors,
     say,
     turn_on_float64,
@@ -42,16 +34,9 @@ DRAWABLE = ("amplitude", "x1", "x2", "period")
 POINT_COLUMNS = ("value", "kind", "belts", "type", "error", "status")
 
 
+@describes()
 def diagram(
-    system: Class = "b",
-    nu0: Nu0 = None,
-    nu1: Nu1 = None,
-    sigma: Sigma = None,
-    sigma0: Sigma0 = None,
-    sigma1: Sigma1 = None,
-    belt: Belts = None,
-    damping: Damping = 0.5,
-    omega: Omega = 1.0,
+    described: Description,
     parameter: Annotated[
         str,
         typer.Option(
@@ -60,9 +45,7 @@ def diagram(
             "belts[1].friction.steepness.",
         ),
     ] = "nu0",
-    span: Annotated[
-        tuple[float, float], typer.Option(metavar="FROM TO", help="Its first and last value.")
-    ] = (-0.7, 0.7),
+    span: Annotated[Interval, from_to("Its first and last value.")] = (-0.7, 0.7),
     rows: Annotated[int, typer.Option(help="About how many values are computed.")] = 160,
     quantity: Annotated[
         str | None,
@@ -71,13 +54,7 @@ def diagram(
             show_default="amplitude where a cycle sticks, else x2, or x1 where there is no cycle",
         ),
     ] = None,
-    out: Annotated[
-        Path,
-        typer.Option(
-            help="Where to write, without an ending: OUT.png, OUT.csv, ... Folders that are "
-            "missing are made."
-        ),
-    ] = Path("diagram"),
+    out: Out = Path("diagram"),
     as_json: Json = False,
 ) -> None:
     """Equilibria and cycles along a parameter, and every bifurcation point, found without a guess.
@@ -110,24 +87,21 @@ def diagram(
             raise ValueError(f"quantity must be one of {', '.join(DRAWABLE)}, got {quantity}")
         check_range("span", span)
         written = outputs(out, ".png", ".csv", "_points.csv")
-        arguments = {"nu0": nu0, "nu1": nu1, "sigma": sigma, "sigma0": sigma0, "sigma1": sigma1}
-        varied = {parameter: span[0]} if parameter in EDGES else {}
-        check_description(system, arguments | varied, belt)
-        paths = parameters(system, belt)
-        short = () if belt else CLASSES[system]
+        described.check(**({parameter: span[0]} if parameter in EDGES else {}))
+        paths, short = described.parameters(), described.short_names
         if parameter not in (*short, *paths):
             known, meant = names_in_words(short, paths), did_you_mean(parameter, (*short, *paths))
             raise ValueError(f"vary must be {known}, got {parameter}{meant}")
         turn_on_float64()
 
         def along(p):
-            return oscillator(system, belt, damping, omega, **{**arguments, parameter: p})
+            return described.oscillator(**{parameter: p})
 
         if parameter in EDGES:
             found = jb.bifurcation_diagram(along, span=span, rows=rows)
             found = replace(found, name=parameter)
         else:
-            osc = oscillator(system, belt, damping, omega, **arguments)
+            osc = described.oscillator()
             found = jb.bifurcation_diagram(osc, _where(osc, paths[parameter]), span, rows=rows)
         from ..plotting.diagrams import plot_diagram
         from ..plotting.style import draw_key, journal_figure, journal_style, save

@@ -9,20 +9,13 @@ import typer
 import jaxbelt as jb
 
 from .options import (
-    Belts,
-    Class,
-    Damping,
+    Description,
+    Interval,
     Json,
-    Nu0,
-    Nu1,
-    Omega,
-    Sigma,
-    Sigma0,
-    Sigma1,
-    check_axis_names,
-    check_description,
+    Out,
     check_range,
-    function_of_axes,
+    describes,
+    from_to,
     make_console,
     outputs,
     plain_errors,
@@ -31,16 +24,9 @@ from .options import (
 )
 
 
+@describes()
 def region_map(
-    system: Class = "b",
-    nu0: Nu0 = None,
-    nu1: Nu1 = None,
-    sigma: Sigma = None,
-    sigma0: Sigma0 = None,
-    sigma1: Sigma1 = None,
-    belt: Belts = None,
-    damping: Damping = 0.5,
-    omega: Omega = 1.0,
+    described: Description,
     axes: Annotated[
         tuple[str, str],
         typer.Option(
@@ -49,20 +35,10 @@ def region_map(
             "as belts[1].friction.steepness.",
         ),
     ] = ("nu0", "nu1"),
-    p: Annotated[
-        tuple[float, float], typer.Option(metavar="FROM TO", help="Values of the first one.")
-    ] = (-0.7, 0.7),
-    q: Annotated[
-        tuple[float, float], typer.Option(metavar="FROM TO", help="Values of the second one.")
-    ] = (-0.7, 0.7),
+    p: Annotated[Interval, from_to("Values of the first one.")] = (-0.7, 0.7),
+    q: Annotated[Interval, from_to("Values of the second one.")] = (-0.7, 0.7),
     cells: Annotated[int, typer.Option(help="Cells along each side, about.")] = 200,
-    out: Annotated[
-        Path,
-        typer.Option(
-            help="Where to write, without an ending: OUT.png, OUT.csv, ... Folders that are "
-            "missing are made."
-        ),
-    ] = Path("map"),
+    out: Out = Path("map"),
     as_json: Json = False,
 ) -> None:
     """The regions of a plane of two parameters, and the curves that bound them: Fig. 6.
@@ -88,9 +64,7 @@ def region_map(
     """
     console = make_console()
     with plain_errors():
-        arguments = {"nu0": nu0, "nu1": nu1, "sigma": sigma, "sigma0": sigma0, "sigma1": sigma1}
-        check_description(system, arguments, belt)
-        check_axis_names(system, axes, belt=belt)
+        described.check_axes(axes)
         if cells < 2:
             raise ValueError(f"cells must be at least 2, got {cells}")
         check_range("p", p)
@@ -99,7 +73,7 @@ def region_map(
         turn_on_float64()
         from ..numerics.spacing import evenly_spaced
 
-        make = function_of_axes(system, arguments, belt, damping, omega, axes)
+        make = described.along(axes)
         pairs = zip(axes, (p, q), cells_along(cells), strict=True)
         values = {name: evenly_spaced(*span, n) for name, span, n in pairs}
         found = jb.region_map(make, values)

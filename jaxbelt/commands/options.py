@@ -5,6 +5,7 @@ mistakes in the options, appear at once.
 """
 
 import functools
+import inspect
 import json
 import math
 import os
@@ -16,6 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -218,6 +220,145 @@ Omega = Annotated[float, typer.Option(help="sqrt(k / m).")]
 Json = Annotated[
     bool, typer.Option("--json", help="Print the results as one line of JSON, for scripts.")
 ]
+Interval = tuple[float, float]
+Start = Annotated[
+    Interval, typer.Option(metavar="X1 X2", help="Displacement x1 and velocity x2 at tau = 0.")
+]
+Tolerance = Annotated[
+    float, typer.Option(help="Relative and absolute tolerance of the integrator.")
+]
+Out = Annotated[
+    Path,
+    typer.Option(
+        help="Where to write, without an ending: OUT.png, OUT.csv, ... Folders that are missing "
+        "are made."
+    ),
+]
+
+
+def from_to(text: str) -> Any:
+    """Option of an interval, FROM TO, with this help."""
+    return typer.Option(metavar="FROM TO", help=text)
+
+
+@dataclass(frozen=True)
+class Description:
+    """Oscillator that options describe: a class of the paper with its arguments, or belts in full.
+
+    A command that is decorated with `describes` has these options.
+    """
+
+    system: Class = "b"
+    nu0: Nu0 = None
+    nu1: Nu1 = None
+    sigma: Sigma = None
+    sigma0: Sigma0 = None
+    sigma1: Sigma1 = None
+    belt: Belts = None
+    damping: Damping = 0.5
+    omega: Omega = 1.0
+
+    @property
+    def arguments(self) -> dict[str, float | None]:
+        """Arguments of the class, None where one is not given."""
+        return {name: getattr(self, name) for name in ("nu0", "nu1", "sigma", "sigma0", "sigma1")}
+
+    @property
+    def short_names(self) -> tuple[str, ...]:
+        """Names of the arguments of the class; none for belts in full."""
+        return () if self.belt else tuple(CLASSES[self.system])
+
+    def check(self, **varied: float) -> None:
+        """Raises unless the options describe belts; the classes themselves check numbers.
+
+        varied: values of arguments of the class that vary.
+        """
+        given = _given(self.arguments | varied)
+        if self.belt:
+            if given:
+                raise ValueError(f"with --belt no class must be described, got {', '.join(given)}")
+            for text in self.belt:
+                _parts_of_belt(text)
+            return
+        check_class(self.system)
+        for name in given:
+            if name not in self.short_names:
+                known = ", ".join(self.short_names)
+                raise ValueError(f"class {self.system} must have only {known}, got {name}")
+
+    def check_axes(self, axes: Iterable[str], others: tuple[str, ...] = ()) -> None:
+        """Raises unless all axes are known and different.
+
+        Known are arguments of the class, parameters of what is described, and `others`.
+        """
+        self.check()
+        paths = self.parameters()
+        names, seen = (*self.short_names, *paths, *others), set()
+        for name in axes:
+            if name not in names:
+                known = names_in_words((*self.short_names, *others), paths)
+                raise ValueError(f"axes must be {known}, got {name}{did_you_mean(name, names)}")
+            if paths.get(name, name) in seen:
+                raise ValueError(f"axes must be different ones, got {name} twice")
+            seen.add(paths.get(name, name))
+
+    def parameters(self) -> dict[str, str]:
+        """Paths of all parameters, by name.
+
+        A path is the place in the oscillator, such as belts[1].friction.steepness. Parameters that
+        have a short name are listed under that, too.
+        """
+        return _parameters(self.system, self.belt)
+
+    def oscillator(self, **values: Any) -> "jb.Oscillator":
+        """The oscillator; values: what differs from the options, as for `oscillator`."""
+        given = {**self.arguments, **values}
+        return oscillator(self.system, self.belt, self.damping, self.omega, **given)
+
+    def along(self, axes: Iterable[str]) -> "Callable[..., jb.Oscillator]":
+        """The oscillator as a function of its axes; the function's text, which datasets keep, can
+        be run."""
+        rest = {"damping": self.damping, "omega": self.omega}
+        if self.belt:
+            return functools.partial(oscillator, belt=tuple(self.belt), **rest)
+        axes, known = tuple(axes), CLASSES[self.system] | _given(self.arguments)
+        fixed = {name: value for name, value in known.items() if name not in axes}
+        if rest == {"damping": 0.5, "omega": 1.0} and known.keys() >= set(axes):
+            make = getattr(jb.presets, f"class_{self.system}")
+            return functools.partial(make, **fixed) if fixed else make
+        return functools.partial(oscillator, self.system, **rest, **fixed)
+
+
+def describes(*names: str) -> Callable:
+    """Decorator of a command: options with these names stand in place of its parameter `described`.
+
+    The command gets a `Description`. Without names all fields of one are options.
+    """
+    options = [
+        inspect.Parameter(
+            field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=field.type
+        )
+        for field in fields(Description)
+        if not names or field.name in names
+    ]
+
+    def decorate(command: Callable) -> Callable:
+        own: list[inspect.Parameter] = []
+        for name, one in inspect.signature(command).parameters.items():
+            is_description = name == "described"
+            own += options if is_description else [one.replace(kind=one.KEYWORD_ONLY)]
+
+        @functools.wraps(command)
+        def call(**given: Any) -> Any:
+            values = {one.name: given.pop(one.name) for one in options}
+            return command(described=Description(**values), **given)
+
+        # By which typer knows the options.
+        vars(call)["__signature__"] = inspect.Signature(own)
+        call.__annotations__ = {one.name: one.annotation for one in own}
+        return call
+
+    return decorate
 
 
 def oscillator(
@@ -229,14 +370,18 @@ def oscillator(
 ) -> "jb.Oscillator":
     """The oscillator that the options describe: a class with its arguments, or belts in full.
 
-    values: arguments of the class and `parameters`, by name; None for one that is not given.
+    values: arguments of the class and parameters, by name; None for one that is not given.
     """
     arguments = {} if belt else CLASSES[system]
     named = {name: value for name, value in values.items() if name in arguments}
-    belts = tuple(map(parse_belt, belt)) if belt else belts_of_class(system, named)
+    from .. import presets
     from ..model.oscillator import Oscillator
 
-    osc, paths = Oscillator(damping, belts, omega), parameters(system, belt)
+    if belt:
+        belts = tuple(map(parse_belt, belt))
+    else:
+        belts = getattr(presets, f"class_{system}")(**CLASSES[system] | _given(named)).belts
+    osc, paths = Oscillator(damping, belts, omega), _parameters(system, belt)
     others = _given({name: value for name, value in values.items() if name not in arguments})
     return _with(osc, {paths[name]: value for name, value in others.items()}) if others else osc
 
@@ -257,12 +402,8 @@ def _with(osc: "jb.Oscillator", values: dict[str, Any]) -> "jb.Oscillator":
     return changed
 
 
-def parameters(system: str, belt: Sequence[str] | None = None) -> dict[str, str]:
-    """Paths of all parameters, by name.
-
-    A path is the place in the oscillator, such as belts[1].friction.steepness. Parameters that have
-    a short name are listed under that, too.
-    """
+def _parameters(system: str, belt: Sequence[str] | None) -> dict[str, str]:
+    """See `Description.parameters`."""
     laws = [_parts_of_belt(text)[1] for text in belt or ()]
     if not laws:
         laws = [LAWS["conti"][1]] * (1 if system == "a" else 2)
@@ -272,24 +413,6 @@ def parameters(system: str, belt: Sequence[str] | None = None) -> dict[str, str]
         fields = ("velocity", *(f"friction.{name}" for name in law), "load", "lower", "upper")
         paths += [f"belts[{i}].{field}" for field in fields]
     return short | {path: path for path in paths}
-
-
-def check_description(
-    system: str, arguments: dict[str, float | None], belt: Sequence[str] | None = None
-) -> None:
-    """Raises unless these options describe belts; the classes themselves check numbers."""
-    given = _given(arguments)
-    if belt:
-        if given:
-            raise ValueError(f"with --belt no class must be described, got {', '.join(given)}")
-        for text in belt:
-            _parts_of_belt(text)
-        return
-    check_class(system)
-    names = CLASSES[system]
-    for name in given:
-        if name not in names:
-            raise ValueError(f"class {system} must have only {', '.join(names)}, got {name}")
 
 
 def _given(arguments: dict[str, Any]) -> dict[str, Any]:
@@ -302,62 +425,11 @@ def check_class(system: str) -> None:
         raise ValueError(f"class must be a, b, c or d, got {system}")
 
 
-def check_axis_names(
-    system: str,
-    axes: Iterable[str],
-    others: tuple[str, ...] = (),
-    belt: Sequence[str] | None = None,
-) -> None:
-    """Raises unless all axes are known and different.
-
-    Known are arguments of the class, parameters of what is described, and `others`.
-    """
-    check_description(system, {}, belt)
-    paths = parameters(system, belt)
-    names, seen = (*({} if belt else CLASSES[system]), *paths, *others), set()
-    for name in axes:
-        if name not in names:
-            known = names_in_words((*({} if belt else CLASSES[system]), *others), paths)
-            meant = did_you_mean(name, names)
-            raise ValueError(f"axes must be {known}, got {name}{meant}")
-        if paths.get(name, name) in seen:
-            raise ValueError(f"axes must be different ones, got {name} twice")
-        seen.add(paths.get(name, name))
-
-
 def names_in_words(names: Iterable[str], paths: dict[str, str]) -> str:
     """Possible names of a parameter: the short ones, or one of many paths."""
     short = dict.fromkeys([*names, *(name for name, path in paths.items() if name != path)])
     one = next(path for path in paths if ".friction." in path)
     return f"one of {', '.join(short)}, or a path such as {one} or belts[0].load"
-
-
-def function_of_axes(
-    system: str,
-    arguments: dict[str, float | None],
-    belt: Sequence[str] | None,
-    damping: float,
-    omega: float,
-    axes: Iterable[str],
-) -> "Callable[..., jb.Oscillator]":
-    """The described oscillator as a function of its axes; the function's text, which datasets
-    keep, can be run."""
-    given, axes = _given(arguments), tuple(axes)
-    if belt:
-        return functools.partial(oscillator, belt=tuple(belt), damping=damping, omega=omega)
-    fixed = {k: v for k, v in (CLASSES[system] | given).items() if k not in axes}
-    if (damping, omega) == (0.5, 1.0) and CLASSES[system].keys() >= set(axes):
-        make = getattr(jb.presets, f"class_{system}")
-        return functools.partial(make, **fixed) if fixed else make
-    return functools.partial(oscillator, system, damping=damping, omega=omega, **fixed)
-
-
-def belts_of_class(system: str, arguments: dict[str, Any]) -> "tuple[jb.Belt, ...]":
-    """The belts of a class of the paper, with the arguments that are given."""
-    from .. import presets
-
-    make = getattr(presets, f"class_{system}")
-    return make(**CLASSES[system] | _given(arguments)).belts
 
 
 def parse_belt(text: str) -> "jb.Belt":

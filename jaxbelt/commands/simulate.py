@@ -11,22 +11,16 @@ import jaxbelt as jb
 
 from ..spelling import did_you_mean
 from .options import (
-    Belts,
-    Class,
-    Damping,
+    Description,
     Json,
-    Nu0,
-    Nu1,
-    Omega,
-    Sigma,
-    Sigma0,
-    Sigma1,
+    Out,
+    Start,
+    Tolerance,
     as_json_value,
-    check_description,
     check_number,
     check_tolerance,
+    describes,
     make_console,
-    oscillator,
     outputs,
     plain_errors,
     say,
@@ -36,20 +30,10 @@ from .options import (
 FORMULATIONS = ("filippov", "switch", "smooth")
 
 
+@describes()
 def simulate(
-    system: Class = "b",
-    nu0: Nu0 = None,
-    nu1: Nu1 = None,
-    sigma: Sigma = None,
-    sigma0: Sigma0 = None,
-    sigma1: Sigma1 = None,
-    belt: Belts = None,
-    damping: Damping = 0.5,
-    omega: Omega = 1.0,
-    start: Annotated[
-        tuple[float, float],
-        typer.Option(metavar="X1 X2", help="Displacement x1 and velocity x2 at tau = 0."),
-    ] = (3.0, 0.0),
+    described: Description,
+    start: Start = (3.0, 0.0),
     t1: Annotated[float, typer.Option(help="End of the time span, which begins at 0.")] = 100.0,
     samples: Annotated[
         int, typer.Option(help="How many times, evenly spread over the span, are written.")
@@ -62,16 +46,8 @@ def simulate(
     ] = "filippov",
     v_star: Annotated[float, typer.Option(help="Half-width of the switch model's band.")] = 1e-3,
     eps: Annotated[float, typer.Option(help="Width of the smooth model's tanh.")] = 1e-3,
-    tolerance: Annotated[
-        float, typer.Option(help="Relative and absolute tolerance of the integrator.")
-    ] = 1e-10,
-    out: Annotated[
-        Path,
-        typer.Option(
-            help="Where to write, without an ending: OUT.png, OUT.csv, ... Folders that are "
-            "missing are made."
-        ),
-    ] = Path("trajectory"),
+    tolerance: Tolerance = 1e-10,
+    out: Out = Path("trajectory"),
     as_json: Json = False,
 ) -> None:
     """Follow one oscillator from one start; write a picture and the numbers.
@@ -119,12 +95,11 @@ def simulate(
         if not all(map(math.isfinite, start)):
             raise ValueError(f"start must be finite, got {start[0]} {start[1]}")
         written = outputs(out, ".png", ".csv", "_events.csv")
-        arguments = {"nu0": nu0, "nu1": nu1, "sigma": sigma, "sigma0": sigma0, "sigma1": sigma1}
-        check_description(system, arguments, belt)
+        described.check()
         turn_on_float64()
         import numpy as np
 
-        osc = oscillator(system, belt, damping, omega, **arguments)
+        osc = described.oscillator()
         trajectory = jb.simulate(
             osc,
             start,

@@ -11,16 +11,14 @@ import jaxbelt as jb
 
 from ..spelling import did_you_mean
 from .options import (
-    Belts,
-    Class,
-    Damping,
+    Description,
     Json,
-    Omega,
-    check_axis_names,
+    Start,
+    Tolerance,
     check_number,
     check_out,
     check_tolerance,
-    function_of_axes,
+    describes,
     make_console,
     plain_errors,
     say,
@@ -39,6 +37,7 @@ VARIABLES = {
 OF_BELTS = ("sticks", "stick_duration", "mode_end")
 
 
+@describes("system", "belt", "damping", "omega")
 def sweep(
     axes: Annotated[
         list[str],
@@ -49,10 +48,7 @@ def sweep(
             "and x2 for starts.",
         ),
     ],
-    system: Class = "b",
-    belt: Belts = None,
-    damping: Damping = 0.5,
-    omega: Omega = 1.0,
+    described: Description,
     observe: Annotated[
         str, typer.Option(help="attractor (what each run leads to) or final (where it ends).")
     ] = "attractor",
@@ -63,19 +59,14 @@ def sweep(
             show_default="kind, of the final state x1_end",
         ),
     ] = None,
-    start: Annotated[
-        tuple[float, float],
-        typer.Option(metavar="X1 X2", help="Displacement x1 and velocity x2 at tau = 0."),
-    ] = (3.0, 0.0),
+    start: Start = (3.0, 0.0),
     t1: Annotated[
         float | None,
         typer.Option(
             help="End of each run.", show_default="30000 for attractors, 100 for the final state"
         ),
     ] = None,
-    tolerance: Annotated[
-        float, typer.Option(help="Relative and absolute tolerance of the integrator.")
-    ] = 1e-8,
+    tolerance: Tolerance = 1e-8,
     out: Annotated[
         Path,
         typer.Option(
@@ -127,7 +118,7 @@ def sweep(
         if part and out.suffix != ".zarr":
             raise ValueError(f"out must end in .zarr where blocks are given, got {out}")
         parsed = list(map(parse_axis, axes))
-        check_axis_names(system, [name for name, _ in parsed], ("x1", "x2"), belt)
+        described.check_axes([name for name, _ in parsed], others=("x1", "x2"))
         values = dict(parsed)
         if observe not in VARIABLES:
             meant = did_you_mean(observe, VARIABLES)
@@ -143,7 +134,7 @@ def sweep(
         check_out(out.with_suffix(".png"))
         turn_on_float64()
         own = [name for name in values if name not in ("x1", "x2")]
-        make = function_of_axes(system, {}, belt, damping, omega, own)
+        make = described.along(own)
         if t1 is None and observe != "attractor":
             t1 = 100.0
         asked: dict[str, Any] = dict(

@@ -1,14 +1,14 @@
-"""When two motions are one attractor: `itinerary`, `place_of` and `is_same`.
+"""Identity of attractors: `itinerary`, `place_of`, `distance` and `is_same`.
 
-An attractor is where it is. What a cycle does in one loop does not tell: there may be two cycles
-with one sequence of events. Two things tell.
+The events of one loop do not identify a cycle: there may be two cycles with one sequence of events.
+Two properties do:
 
-- Its itinerary: the modes that it passes, whole ones, with the contact of every belt in each. So
-  it says on which side of every contact edge the mass sticks, and with which sign of r it slips. A
+- Its itinerary: the modes that it passes, whole ones, with the contact of every belt in each. So it
+  says on which side of every contact edge the mass sticks, and with which sign of r it slips. A
   stick phase ends at a place that its modes determine, and the orbit goes on from there in one way
   only: of cycles that stick there is one with each itinerary.
-- Its place: how far it extends, and how long it takes. Orbits that do not stick do not meet, so of
-  two such cycles one lies inside of the other, or beside it.
+- Its place: its extent, and its period. Orbits that do not stick do not meet, so of two such cycles
+  one lies inside of the other, or beside it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..model.events import of_one_loop
 from ..model.modes import ABOVE
@@ -29,26 +30,32 @@ from .shooting import Ends
 if TYPE_CHECKING:
     import xarray
 
-#: The modes of one loop, contact codes of all belts each, from the least of their orders on.
+#: The modes of one loop, contact codes of all belts each, beginning with the least of their orders.
 Itinerary = tuple[tuple[int, ...], ...]
-#: An arc that takes no longer is there by rounding: those between two events at one place take
+#: Arcs that take no longer exist by rounding only: those between two events at one place take
 #: 1e-26, and where a bifurcation is narrowed to 1e-9 of a span some 1e-9.
 MOMENT = 1e-13
 #: An arc that vanishes as the square of a distance may take more than MOMENT at one value of a
 #: parameter and less at the next one; it counts at both if it takes longer than this.
 LEAST_MOMENT = 1e-16
-#: Places of one cycle that shooting solved for differ by less, relative to its size: its equations
-#: hold to 1e-9, and beside a fold a cycle moves by ten thousand times that.
-SOLVED = 1e-5
-#: The same of runs of a sweep, times its tolerance: its errors are ten to a thousand times that.
-#: Where they are further apart, but not as far as APART, or their events differ, shooting tells.
+#: Distance below which two cycles that shooting solved for are the same: its equations hold to
+#: 1e-9, and beside a fold a cycle moves by ten thousand times that.
+SAME_CYCLE = 1e-5
+#: The same for runs of a sweep, times its tolerance: its errors are ten to a thousand times that.
 RUN = 1e3
-APART = 1e-2
+#: Distance below which two motions may be the same: ends of two pieces of one branch; runs whose
+#: distance or events leave it open, which shooting then decides.
+MAYBE_SAME = 1e-2
+#: Distance below which an unstable cycle goes on to one at the next value of a parameter.
+GOES_ON = 0.3
 
 
 def itinerary(osc: Oscillator, loop: Cycle | Loop, moment: float = MOMENT) -> Itinerary:
-    """The modes of one loop in order, wherever it was begun, but for those that last no longer than
-    `moment`: where slip onset lies on an edge rounding tells which comes first."""
+    """The modes of one loop in order, from whatever place it was begun.
+
+    Modes that last no longer than `moment` are left out: where slip onset lies on an edge rounding
+    decides which comes first.
+    """
     chain, rows = arcs_of(loop)
     modes, lasts = modes_of(chain), rows[:, 2] > moment
     modes = without_idle(osc, modes[lasts] if np.any(lasts) else modes)
@@ -81,7 +88,7 @@ PLACE_DIMENSIONS = ("length", "length", "velocity", "velocity", "time")
 
 
 def place_of(cycle: Cycle | Loop) -> np.ndarray:
-    """Where a cycle is: smallest and largest x1, smallest and largest x2, period."""
+    """Place of a cycle: smallest and largest x1, smallest and largest x2, period."""
     return extent(arcs_of(cycle)[1])
 
 
@@ -95,23 +102,29 @@ def arcs_of(cycle: Cycle | Loop) -> tuple[Chain | Loop, np.ndarray]:
 
 
 def extent(rows: np.ndarray) -> np.ndarray:
-    """What `place_of` tells, by (x1, x2, T) of the arcs that are used, [arcs, 3]."""
+    """`place_of` from (x1, x2, T) of the arcs that are used, [arcs, 3]."""
     x1, x2, durations = rows.T
     return np.array([x1.min(), x1.max(), x2.min(), x2.max(), durations.sum()])
 
 
-def apart(place: np.ndarray, other: np.ndarray) -> float:
-    """How far apart two places are, relative to the larger of the two."""
-    size = max(np.ptp(place[:4]), np.ptp(other[:4]))
-    return float(np.max(np.abs(place - other)) / size)
+def distance(place: ArrayLike, other: ArrayLike, least: float = 0.0) -> Any:
+    """Distance between motions by their places, [.., 5], or the first numbers of them.
+
+    It is relative to the size of the larger motion, its largest extent; to `least` where that is
+    larger.
+    """
+    one, two = np.asarray(place), np.asarray(other)
+    size = np.maximum(np.ptp(one[..., :4], axis=-1), np.ptp(two[..., :4], axis=-1))
+    size = np.maximum(size, least)
+    return np.max(np.abs(one - two), axis=-1) / np.where(size > 0, size, 1.0)
 
 
-def is_same(cycle: Cycle, other: Cycle, tolerance: float = SOLVED) -> bool:
-    """Whether two cycles of one oscillator are one; both with status OK."""
+def is_same(cycle: Cycle, other: Cycle) -> bool:
+    """Whether two cycles of one oscillator are the same; both with status OK."""
     if int(cycle.status) != Status.OK or int(other.status) != Status.OK:
         return False
     modes, others = (itinerary(one.oscillator, one) for one in (cycle, other))
-    return modes == others and apart(place_of(cycle), place_of(other)) < tolerance
+    return modes == others and distance(place_of(cycle), place_of(other)) < SAME_CYCLE
 
 
 def distinct(cycles: Sequence[Cycle]) -> list[Cycle]:
@@ -124,21 +137,22 @@ def distinct(cycles: Sequence[Cycle]) -> list[Cycle]:
     return found
 
 
-# --- what a sweep tells of attractors -------------------------------------------------------------
+# --- attractors of the runs of a sweep ------------------------------------------------------------
 
 
 def error_of_runs(numbers: Mapping[str, Any], length: float) -> float:
-    """As far may places of one cycle be apart, relative to its size, in runs of such tolerances."""
+    """Largest distance of places of one cycle, relative to its size, in runs with such
+    tolerances."""
     atol = numbers.get("atol")
     return RUN * max(numbers["rtol"], 0.0 if atol is None else atol / length)
 
 
 @dataclass(frozen=True)
 class Runs:
-    """Where the attractors of the runs of a sweep are, and what happens in a loop, in own units.
+    """Places of the attractors of the runs of a sweep, and their events, in own units.
 
-    places: as `place_of`, [.., 5], the period of what is at rest 0; signatures: names, [..]; error:
-    as far may places of one cycle be apart, relative to its size.
+    places: as `place_of`, [.., 5], with the period 0 at rest; signatures: names, [..]; error:
+    largest distance of places of one cycle, relative to its size.
     """
 
     places: np.ndarray
@@ -159,14 +173,12 @@ class Runs:
         return cls(places, signatures, error_of_runs(dataset.attrs, dataset.attrs["length"]))
 
     def at(self, index: Any) -> "Runs":
-        """Some of them, by an index of the arrays."""
+        """Some of the runs, by an index of the arrays."""
         return Runs(self.places[index], np.asarray(self.signatures[index]), self.error)
 
     def same(self, others: "Runs") -> tuple[np.ndarray, np.ndarray]:
-        """Which of two runs each lead to one cycle, and for which this does not tell."""
-        both = np.stack(np.broadcast_arrays(self.places, others.places))
-        size = np.max(np.ptp(both[..., :4], axis=-1), axis=0)
-        away = np.max(np.abs(both[0] - both[1]), axis=-1) / np.where(size > 0, size, 1.0)
+        """Which pairs of runs lead to one cycle, and for which pairs this is not certain."""
+        away = distance(self.places, others.places)
         fits = self.signatures == others.signatures
         same = fits & (away < self.error)
-        return same, ~same & (away < max(APART, 10 * self.error))
+        return same, ~same & (away < max(MAYBE_SAME, 10 * self.error))

@@ -1,11 +1,11 @@
 """Motion backwards in time, and unstable cycles that are solved for there.
 
 In reversed time, t -> -t and x2 -> -x2, an oscillator is one with the signs of its damping, loads
-and velocities changed. It never sticks: orbits that do not stick go on backwards in one way.
+and velocities changed. It never sticks: orbits that do not stick continue backwards in one way.
 
 Slow belts with steep friction laws make cycles whose multiplier is 1e20. They pass along a
-boundary, just off it, for a long time; forwards no number leads to such a cycle, backwards all of
-them do.
+boundary, just off it, for a long time; forwards no floating-point start leads to such a cycle,
+backwards all of them do.
 """
 
 import equinox as eqx
@@ -42,24 +42,29 @@ class BackwardCycle(Cycle):
         return Cycle.__repr__(self)
 
 
-def reversed_in_time(osc: Oscillator) -> Oscillator:
-    """The oscillator whose motion (x1, -x2) is the motion of `osc` backwards."""
+def moved_in_time(osc: Oscillator, way: Array | float) -> Oscillator:
+    """The oscillator itself, way = 1, or the one reversed in time, way = -1."""
     return eqx.tree_at(
         lambda o: [o.damping, *(b.velocity for b in o.belts), *(b.load for b in o.belts)],
         osc,
-        replace_fn=lambda leaf: -leaf,
+        replace_fn=lambda leaf: leaf * way,
     )
 
 
+def reversed_in_time(osc: Oscillator) -> Oscillator:
+    """The oscillator whose motion (x1, -x2) is the motion of `osc` backwards."""
+    return moved_in_time(osc, -1.0)
+
+
 def solved(osc: Oscillator, loop: Loop) -> Cycle:
-    """The cycle that a known loop nearly is."""
+    """The cycle near a known loop."""
     return exactly(osc, cut([loop])[0], jnp.asarray(np.array(Status.OK.value)))
 
 
 def forwards(osc: Oscillator, cycle: Cycle) -> BackwardCycle:
     """The unstable cycle of an oscillator, from the attracting one of that reversed in time.
 
-    Each arc begins where it ended, and ends by what the arc before it, now after it, ended by.
+    Each arc begins where it ended, and ends as the arc before it, which is now after it, ended.
     """
     chain, z = cycle.chain, np.asarray(cycle.unknowns)
     n = int(np.sum(np.asarray(chain.used)))

@@ -1,7 +1,7 @@
 """Closed chains of arcs, and the loops of orbits that are guesses of them.
 
-Their number is padded to a few fixed sizes, and what they are is data, so that one compiled program
-serves all signatures.
+The number of arcs is padded to a few fixed sizes, and their modes and ends are data, so that one
+compiled program serves all signatures.
 """
 
 from collections.abc import Sequence
@@ -17,14 +17,14 @@ from ..model.events import Signature, events_of
 from ..model.own_units import quantity
 from ..motion.arcs import Ends
 
-#: Arcs in a chain: what is needed is rounded up to one of these; the first one under a trace.
+#: Sizes of chains: the number of arcs is rounded up to one of these; the first one under a trace.
 SIZES = (16, 32, 64)
 
 
 class Chain(eqx.Module):
     """A closed sequence of arcs: contact codes [arcs, belts], ends [arcs], and step fractions.
 
-    ends: numbers of `arcs.Ends`. An unused arc is of duration zero.
+    ends: numbers of `arcs.Ends`. An unused arc has a duration of zero.
     """
 
     codes: Array
@@ -42,8 +42,10 @@ class Chain(eqx.Module):
 
 
 class Loop(eqx.Module):
-    """One loop of an orbit, arc by arc, padded: codes and ends of a `Chain`, and a guess of its
-    unknowns, the entry states and durations."""
+    """One loop of an orbit, arc by arc, padded.
+
+    Codes and ends of a `Chain`, and a guess of its unknowns, the entry states and durations.
+    """
 
     codes: Array
     ends: Array
@@ -56,13 +58,20 @@ class Loop(eqx.Module):
 
     @property
     def exits(self) -> Array:
-        """The states at the ends of the arcs; after the last used one comes the first."""
+        """States at the ends of the arcs; after the last used arc comes the first."""
         last = jnp.arange(self.ends.size) == jnp.sum(self.used) - 1
         return jnp.where(last[:, None], self.entries[0], jnp.roll(self.entries, -1, axis=0))
 
 
+def blank_loop(size: int, belts: int) -> Loop:
+    """A loop without arcs, for its shapes."""
+    unused = np.full(size, Ends(belts).unused)
+    arrays = np.ones((size, belts)), unused, np.zeros((size, 2)), np.zeros(size)
+    return Loop(*map(jnp.asarray, arrays))
+
+
 def modes_of(loop: Chain | Loop) -> np.ndarray:
-    """The contact codes of the arcs of one loop, [arcs, belts], without those that are unused."""
+    """Contact codes of the arcs of one loop, [arcs, belts], without those that are unused."""
     codes, ends = np.asarray(loop.codes), np.asarray(loop.ends)
     return codes[ends != Ends(codes.shape[-1]).unused].astype(int)
 
@@ -73,19 +82,19 @@ def loop_events(loop: Chain | Loop) -> Signature:
 
 
 def following_codes(chain: Chain | Loop) -> Array:
-    """Contact codes of the arc after each; after the last used one comes the first."""
+    """Contact codes of the arc after each; after the last used arc comes the first."""
     following = jnp.roll(chain.codes, -1, axis=0)
     last = jnp.arange(chain.ends.size) == jnp.sum(chain.used) - 1
     return jnp.where(last[:, None], chain.codes[0], following)
 
 
 def room_of(arcs: int) -> int:
-    """The size of a chain that so many arcs, SIZES[-1] at most, are given."""
+    """The size of a chain for this number of arcs, SIZES[-1] at most."""
     return next(size for size in SIZES if size >= arcs)
 
 
 def cut(loops: Sequence[Loop], *, more: int = 0) -> list[Loop]:
-    """The loops, known ones, with no more room than the longest of them needs, and some more."""
+    """Known loops with no more room than the longest of them needs, and `more` rows."""
     unused = Ends(loops[0].codes.shape[-1]).unused
     longest = max(int(np.sum(np.asarray(loop.ends) != unused)) for loop in loops)
     room = slice(room_of(min(longest + more, SIZES[-1])))

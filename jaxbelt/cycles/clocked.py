@@ -25,7 +25,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..checks import require
-from ..model.instants import carried, course, guards_at
+from ..model.instants import carried, guards_at, trend_of
 from ..model.modes import capacity, mode_acceleration, mode_of, select
 from ..model.oscillator import Oscillator, at_time, frequencies
 from ..motion.arcs import Ends
@@ -362,7 +362,7 @@ def guards_along(osc: Oscillator, chain: TimedChain, z: Array) -> tuple[Array, A
         mode = mode_of(codes)
 
         def at(y):
-            found = course(osc, mode, lambda y: guards_at(osc, mode, y), (y[0], y[1], y[2]))
+            found = trend_of(osc, mode, lambda y: guards_at(osc, mode, y), (y[0], y[1], y[2]))
             return found.value, found.slope
 
         states = states_along(osc, codes, mesh, unknown[:3], unknown[3])
@@ -379,7 +379,7 @@ def least_guard(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: 
     mode = mode_of(codes)
     states = states_along(osc, codes, mesh, y, duration)
     at = jax.vmap(
-        lambda y: course(osc, mode, lambda y: guards_at(osc, mode, y), (y[0], y[1], y[2]))
+        lambda y: trend_of(osc, mode, lambda y: guards_at(osc, mode, y), (y[0], y[1], y[2]))
     )(states)
     there = jnp.isfinite(at.value)
     h = jnp.diff(states[:, 2])[:, None]

@@ -1,4 +1,4 @@
-"""Steady cycles, stable and unstable: `find_cycle`, `unstable_cycle` and what they return, `Cycle`.
+"""Steady cycles, stable and unstable: `find_cycle`, `unstable_cycle` and their result, `Cycle`.
 
 A start is followed until a loop of its orbit repeats (`orbits`); that loop is the signature and the
 guess from which `shooting` solves for the cycle.
@@ -35,6 +35,7 @@ from ..model.rest import is_neutral
 from ..motion.simulate import Arcs
 from ..numerics.compiling import any_lane, in_groups, jit
 from ..numerics.newton import HOLDS
+from ..numerics.padding import longer
 from ..results import Status, describe, draw
 from ..tables import per_belt, require_single, table_of
 from .chains import SIZES, Chain, Loop, loop_events, modes_of, room_of
@@ -56,31 +57,32 @@ if TYPE_CHECKING:
     import pandas
 
 #: Integration steps per slip arc where ARC_STEPS leave a larger error in the equations than EXACT,
-#: as halved steps tell it.
+#: as estimated by halving the steps.
 FINE_STEPS, EXACT = 32, 1e-11
-#: And these, for long arcs that creep along a strongly damped oscillator's slow direction, where
-#: nothing is traced.
+#: Numbers of steps after these, for known oscillators: for long arcs that creep along a strongly
+#: damped oscillator's slow direction.
 FINER_STEPS = (128, 512)
-#: A solution that is known to this part of its size is a cycle: on the way to an equilibrium, which
-#: is a double root, each of Newton's steps is half of what is left.
-TOLD_APART = 1e-2
-#: Speeds that differ by less than this part of them are one.
+#: A solution with a smaller relative error is a cycle: on the way to an equilibrium, which is a
+#: double root, each Newton step is half of what is left.
+DISTINCT = 1e-2
+#: Speeds that differ by less than this part of them count as equal.
 SAME_SPEED = 1e-9
 
 
 class Cycle(eqx.Module):
     """A steady cycle, differentiable with respect to every parameter of its oscillator.
 
-    oscillator: whose cycle it is; chain: its arcs, see `Chain`; unknowns: (x1, x2, T) at the entry
-    of every arc, [arcs, 3]; both padded. multiplier: nontrivial Floquet multiplier, the determinant
-    of the monodromy matrix with its saltation matrices, exactly 0 where the cycle sticks. residual:
-    largest error in the shooting equations. iterations: Newton steps. status: a `Status` code;
-    where it is not OK every number is NaN.
+    A cycle that sticks begins at the end of its longest stick phase, any other at its largest x1.
 
-    `period`; `stick_durations`, [belts], summed over the phases of one loop; `x1_min`, `x1_max`,
-    `x2_min`, `x2_max`; `stable`; `signature`, ((kind, belt), ...) of the events of one loop;
-    `arcs`, as of a trajectory; `sample(n)`. A cycle that sticks begins at the end of its longest
-    stick phase, any other at its largest x1.
+    Attributes:
+        oscillator: The oscillator.
+        chain: Its arcs, see `Chain`; padded.
+        unknowns: (x1, x2, T) at the entry of every arc, [arcs, 3], in dimensionless units; padded.
+        multiplier: Nontrivial Floquet multiplier, the determinant of the monodromy matrix with its
+            saltation matrices; exactly 0 where the cycle sticks.
+        residual: Largest error in the shooting equations.
+        iterations: Number of Newton steps.
+        status: A `Status` code; where it is not OK every number is NaN.
     """
 
     oscillator: Oscillator
@@ -93,32 +95,39 @@ class Cycle(eqx.Module):
 
     @property
     def period(self) -> Array:
+        """Duration of one loop, in dimensionless time tau."""
         return jnp.sum(self.unknowns[..., 2], axis=-1)
 
     @property
     def stick_durations(self) -> Array:
-        # A product, so that NaN stays, also of a belt that the mass does not stick to.
+        """Time stuck to each belt in one loop, summed over its stick phases, [belts]."""
+        # A product, so that NaN stays, also for a belt that the mass does not stick to.
         stuck = jnp.where(self.chain.codes == 0, 1.0, 0.0)
         return jnp.sum(self.unknowns[..., 2:] * stuck, axis=-2)
 
     @property
     def x1_min(self) -> Array:
+        """Smallest displacement."""
         return jnp.min(self.unknowns[..., 0], axis=-1)
 
     @property
     def x1_max(self) -> Array:
+        """Largest displacement."""
         return jnp.max(self.unknowns[..., 0], axis=-1)
 
     @property
     def x2_min(self) -> Array:
+        """Smallest velocity."""
         return jnp.min(self.unknowns[..., 1], axis=-1)
 
     @property
     def x2_max(self) -> Array:
+        """Largest velocity."""
         return jnp.max(self.unknowns[..., 1], axis=-1)
 
     @property
     def stable(self) -> Array:
+        """Whether it attracts: `|multiplier|` < 1."""
         return jnp.abs(self.multiplier) < 1
 
     @property
@@ -139,7 +148,7 @@ class Cycle(eqx.Module):
 
     @property
     def signature(self) -> Signature:
-        """The events of one loop, (kind, belt) each; outside of transformations only."""
+        """The events of one loop, ((kind, belt), ...); outside of transformations only."""
         require(
             is_concrete(self.chain) and self.chain.ends.ndim == 1,
             "signature",
@@ -149,11 +158,18 @@ class Cycle(eqx.Module):
         return loop_events(self.chain) if int(self.status) == Status.OK else ()
 
     def sample(self, n: int) -> Array:
-        """States (x1, x2) at n times evenly spread over one period, ends included, [n, 2]."""
+        """States evenly spread in time over one period.
+
+        Args:
+            n: Number of states, ends included.
+
+        Returns:
+            The states (x1, x2), [n, 2].
+        """
         return sample_cycle(self.oscillator, self.chain, self.unknowns, as_whole(n, "n"))
 
     def row(self) -> dict[str, Any]:
-        """What `table` tells of it."""
+        """The row of the cycle in `table`."""
         require_single(self, self.multiplier, 0)
         known = int(self.status) == Status.OK
         x1, x2 = (self.x1_min, self.x1_max), (self.x2_min, self.x2_max)
@@ -177,15 +193,27 @@ class Cycle(eqx.Module):
         }
 
     def table(self) -> "pandas.DataFrame":
-        """One row: stable, x1_min, x1_max, x2_min, x2_max, period, amplitude (half the range of
-        x1), multiplier, stick_duration_0, ... of each belt, residual, iterations, signature (its
-        events in order, such as stick1-slip1), status. `cycle.arcs.table()` has its arcs."""
+        """Returns one row.
+
+        Columns: stable, x1_min, x1_max, x2_min, x2_max, period, amplitude (half the range of x1),
+        multiplier, stick_duration_0, ... of each belt, residual, iterations, signature (its events
+        in order, such as stick1-slip1), status. `cycle.arcs.table()` has its arcs.
+        """
         return table_of([self.row()])
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw it in the phase plane of its oscillator, with the boundaries and equilibria there,
-        into the axes `ax` (None: new ones), which are returned. `ValueError` where there is no
-        cycle."""
+        """Draws the cycle in the phase plane of its oscillator, with the boundaries and equilibria
+        there.
+
+        Args:
+            ax: Axes; None makes new ones.
+
+        Returns:
+            The axes.
+
+        Raises:
+            ValueError: If there is no cycle.
+        """
         return draw(self, ax)
 
     def __repr__(self) -> str:
@@ -203,7 +231,8 @@ class Cycle(eqx.Module):
 
 
 def cycle_of_zeros(osc: Oscillator) -> Cycle:
-    """What has the shapes of a cycle of that oscillator, on which functions of cycles are tried."""
+    """An object with the shapes of a cycle of that oscillator, on which functions of cycles are
+    tried."""
     arcs, number, whole = SIZES[0], jnp.zeros(()), jnp.zeros((), int)
     codes, mesh = jnp.zeros((arcs, len(osc.belts))), jnp.zeros((arcs, FINE_STEPS))
     chain = Chain(codes, jnp.zeros(arcs, int), mesh)
@@ -212,7 +241,7 @@ def cycle_of_zeros(osc: Oscillator) -> Cycle:
 
 @jit
 def as_loop(cycle: Cycle, size: int) -> Loop:
-    """The loop that a cycle is, padded to `size` arcs."""
+    """A cycle as a loop, padded to `size` arcs."""
     chain, z = cycle.chain, cycle.unknowns
     own = np.arange(size) < len(z)
     source = np.where(own, np.arange(size), 0)
@@ -242,12 +271,11 @@ def cycle_of(
     status: Array,
     error: Array | None = None,
 ) -> tuple[Cycle, Array]:
-    """The `Cycle` of a solution z, NaN with a status where it is none; and its multiplier with
-    stick phases left out.
+    """The `Cycle` of a solution z, and its multiplier with stick phases left out.
 
-    error: the largest in its equations, where these are not those of the chain and it is known that
-    they hold: an arc that was solved for backwards may magnify what is followed forwards a hundred
-    thousand times.
+    Where z is no cycle, its numbers are NaN and it has a status. error: the largest in its
+    equations, where these differ from those of the chain and are known to hold: an arc that was
+    solved for backwards may magnify errors a hundred thousand times when it is followed forwards.
     """
     residual, slope = closure(osc, chain, z)
     if error is None:
@@ -279,8 +307,10 @@ def _first_failure(status: Array, fine: Array, code: Status) -> Array:
 
 @jit
 def _loop_reached(osc: Oscillator, y0: Array, size: int) -> tuple[Loop, Array, Array, Array]:
-    """The loop that the start leads to, in `size` arcs; how many it has, a status, and the state in
-    which the orbit was left."""
+    """The loop that the start leads to, in `size` arcs.
+
+    Also returns its number of arcs, a status, and the state at the end of the orbit.
+    """
     reached = in_groups(functools.partial(_loop_reached_by_lane, size=size))
     return reached(*lax.stop_gradient((osc, y0)))
 
@@ -310,7 +340,7 @@ def _if_it_fits(status: Array, count: Array, size: int) -> Array:
 
 
 def exactly(osc: Oscillator, loop: Loop, status: Array) -> Cycle:
-    """The cycle that a loop nearly is, with as many integration steps as it takes."""
+    """The cycle near a loop, with as many integration steps as it needs."""
     if not is_concrete((osc, loop, status)):
         return _exactly_in_lanes(osc, loop, status)
     cycle, error = _polished(osc, loop, status, ARC_STEPS)
@@ -323,7 +353,7 @@ def exactly(osc: Oscillator, loop: Loop, status: Array) -> Cycle:
             # With the order two that is left across a kink.
             finest = change * (coarser / FINER_STEPS[-1]) ** 2
             if change < EXACT or (finest > HOLDS and _slips_across_change(osc, loop)):
-                break  # not for its steps, or more of them do not help
+                break  # not because of its steps, or more of them do not help
         coarser = steps
         finer, remaining = _polished(osc, loop, status, steps)
         if int(cycle.status) == Status.OK and remaining > 0.1 * error:
@@ -333,8 +363,10 @@ def exactly(osc: Oscillator, loop: Loop, status: Array) -> Cycle:
 
 
 def _slips_across_change(osc: Oscillator, loop: Loop) -> bool:
-    """Whether the mass slips, on a known loop, at the speed at which a law of one's own has its
-    largest jump or kink."""
+    """Whether the mass slips, on a known loop, at the speed of the largest jump or kink of a law.
+
+    That is of a user's law.
+    """
     slips = _slip_speeds(osc, modes_of(loop), np.asarray(loop.entries)[:, 1])
     for belt, speeds in zip(osc.belts, slips, strict=True):
         for change in jump_and_kink(belt.friction) if speeds.size else ():
@@ -347,8 +379,10 @@ def _slips_across_change(osc: Oscillator, loop: Loop) -> bool:
 
 
 def _slip_speeds(osc: Oscillator, modes: np.ndarray, x2: np.ndarray) -> list[np.ndarray]:
-    """Of each belt the speeds at both ends of the arcs of a known loop that slip on it, [2, arcs];
-    between these an arc's speed rises or falls throughout."""
+    """For each belt the speeds at both ends of the arcs of a known loop that slip on it, [2, arcs].
+
+    Between these an arc's speed rises or falls throughout.
+    """
     begin = x2[: len(modes)]
     ends = np.stack([begin, np.roll(begin, -1)])
     return [
@@ -358,9 +392,9 @@ def _slip_speeds(osc: Oscillator, modes: np.ndarray, x2: np.ndarray) -> list[np.
 
 
 def warn_of_extrapolation(cycles: Iterable[Cycle], depth: int = 4) -> None:
-    """Warn where known cycles slip faster than what was measured of a belt's friction.
+    """Warns where known cycles slip faster than the measured range of a belt's friction.
 
-    depth: the `stacklevel` of who called the entry that asks.
+    depth: the `stacklevel` of the caller of the public function.
     """
     known = (one for one in cycles if is_concrete(one) and int(one.status) == Status.OK)
     loops = ((one.oscillator, one.chain, np.asarray(one.unknowns)[:, 1]) for one in known)
@@ -395,7 +429,7 @@ def _is_inexact(cycle: Cycle, error: Array) -> Array:
 
 @jit
 def _mesh_error(osc: Oscillator, loop: Loop, steps: int) -> Array:
-    """How much halved steps change the equations of a loop as it is, at most."""
+    """Largest change of the equations of a loop, as it is, with halved steps."""
     chain, z = meshed(osc, loop, steps)
     values = (residual(osc, one, z)[0] for one in (chain, chain.halved))
     return jnp.max(jnp.abs(jnp.subtract(*values)))
@@ -403,7 +437,7 @@ def _mesh_error(osc: Oscillator, loop: Loop, steps: int) -> Array:
 
 @jit
 def _exactly_in_lanes(osc: Oscillator, loop: Loop, status: Array) -> Cycle:
-    """`exactly` under a trace: a chain of FINE_STEPS, those that are not needed of length zero."""
+    """`exactly` under a trace: a chain of FINE_STEPS, some of which may have length zero."""
     solved = in_groups(_solved_in_lanes)(*lax.stop_gradient((osc, loop, status)))
     mesh, z, iterations, status = solved
     chain = Chain(loop.codes, loop.ends, mesh)
@@ -411,14 +445,14 @@ def _exactly_in_lanes(osc: Oscillator, loop: Loop, status: Array) -> Cycle:
 
 
 def _solved_in_lanes(osc: Oscillator, loop: Loop, status: Array) -> tuple[Array, ...]:
-    """Its mesh, unknowns, number of Newton steps, and status."""
+    """Mesh, unknowns, number of Newton steps, and status."""
     coarse, error = _polished(osc, loop, status, ARC_STEPS)
-    padding = [(0, 0)] * (coarse.chain.mesh.ndim - 1) + [(0, FINE_STEPS - ARC_STEPS)]
-    found = jnp.pad(coarse.chain.mesh, padding), *_solution_of(coarse)
+    mesh = longer(coarse.chain.mesh, FINE_STEPS, axis=-1, fill=0.0)
+    found = mesh, *_solution_of(coarse)
     inexact = _is_inexact(coarse, error) & (status == Status.OK)
 
     def fine():
-        # Nothing is solved for in lanes that need it not.
+        # Lanes that do not need it are not solved.
         own_status = jnp.where(inexact, status, Status.NO_CONVERGENCE.value)
         finer = polish(osc, loop, own_status, FINE_STEPS)
         return select(inexact, (finer.chain.mesh, *_solution_of(finer)), found)
@@ -432,7 +466,7 @@ def _solution_of(cycle: Cycle) -> tuple[Array, Array, Array]:
 
 @jit
 def _polished(osc: Oscillator, loop: Loop, status: Array, steps: int) -> tuple[Cycle, Array]:
-    """The cycle that a loop nearly is, and the error in its equations with halved steps."""
+    """The cycle near a loop, and the error in its equations with halved steps."""
     chain, guess = meshed(lax.stop_gradient(osc), loop, steps)
     # Where there is no loop nothing is solved for: a step that is not finite is the last one, and
     # the other lanes of a batch need not wait.
@@ -440,18 +474,18 @@ def _polished(osc: Oscillator, loop: Loop, status: Array, steps: int) -> tuple[C
     z, iterations, off = solve_closed(osc, chain, guess)
     error, _ = closure(*lax.stop_gradient((osc, chain.halved, z)))
     # Near a fixed point that hardly attracts or repels all small loops nearly close.
-    is_told = off < TOLD_APART * jnp.max(jnp.ptp(z[:, :2], axis=0))
-    status = _first_failure(status, (error < HOLDS) & is_told, Status.NO_CONVERGENCE)
+    is_known = off < DISTINCT * jnp.max(jnp.ptp(z[:, :2], axis=0))
+    status = _first_failure(status, (error < HOLDS) & is_known, Status.NO_CONVERGENCE)
     return cycle_of(osc, chain, z, iterations, status)[0], error
 
 
 def polish(osc: Oscillator, loop: Loop, status: Array, steps: int = ARC_STEPS) -> Cycle:
-    """The cycle that a loop nearly is, by Newton's method; one program for all that need it."""
+    """The cycle near a loop, by Newton's method; one program for all callers."""
     return _polished(osc, loop, status, steps)[0]
 
 
-#: How often an orbit is followed on for MOST_ARCS where it has not settled: to a cycle with the
-#: multiplier 0.99, in loops of eight arcs, it has then come to 1e-7.
+#: How often an orbit is followed on for MOST_ARCS where it has not repeated: with the multiplier
+#: 0.99, in loops of eight arcs, it has then come within 1e-7 of its cycle.
 MORE_BUDGETS = 15
 
 
@@ -459,23 +493,29 @@ MORE_BUDGETS = 15
 def find_cycle(
     osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None = None
 ) -> Cycle | PeriodicMotion:
-    """The steady cycle that the start y0 leads to.
-
-    osc: `Oscillator`; y0: start (x1, x2), shape [2]. max_arcs: room for the arcs of one loop, where
-    under a transformation 16 are not enough.
+    """The steady cycle that a start leads to.
 
     The orbit is followed until a loop repeats (up to some thousand loops, under a transformation a
-    hundred); then all arcs are polished together by Newton's
-    method. Differentiable with respect to the parameters (the derivative with respect to y0 is
-    zero: a cycle does not depend on where it was approached from), forward and reverse, and under
-    `jax.vmap`. At a bifurcation point, as where two belts run at one velocity, the derivatives of
-    its two sides differ, and what is given may be neither, see `simulate`. Where the start leads to
-    an equilibrium, to one of a continuum of closed orbits, or nothing repeats, the status says so.
-    `ValueError` names an argument that is impossible.
+    hundred); then Newton's method solves for all arcs together. The result is differentiable with
+    respect to the parameters, forward and reverse, and works under `jax.vmap`. (The derivative with
+    respect to y0 is zero: a cycle does not depend on where it was approached from.) At a
+    bifurcation point, as where two belts have one velocity, the derivatives of its two sides
+    differ, and the returned one may be neither, see `simulate`.
 
-    Of a forced oscillator y0 is the start at t = 0, and what is returned is the `PeriodicMotion`
-    that the start leads to, of up to 16 periods of the forcing; not under `jax.jit` and `jax.vmap`,
-    see `periodic`. Where the orbit is chaotic or quasi-periodic its status is NOT_SETTLED.
+    Args:
+        osc: The oscillator.
+        y0: Start (x1, x2), shape [2].
+        max_arcs: Room for the arcs of one loop, where under a transformation 16 are not enough.
+
+    Returns:
+        The `Cycle`. Where the start leads to an equilibrium, to one of a continuum of closed
+        orbits, or nothing repeats, its status says so. Of a forced oscillator y0 is the start at
+        t = 0, and the `PeriodicMotion` that it leads to is returned, of up to 16 periods of the
+        forcing (not under `jax.jit` and `jax.vmap`, see `periodic`); where the orbit is chaotic or
+        quasi-periodic its status is NOT_SETTLED.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(osc)
     y0 = as_array(y0, "y0", (2,))
@@ -489,7 +529,7 @@ def find_cycle(
 
 
 def cycle_from(osc: Oscillator, y0: Array | np.ndarray, max_arcs: int | None = None) -> Cycle:
-    """What `find_cycle` returns, without its checks and its warning."""
+    """`find_cycle` without its checks and its warning."""
     own = in_own_units(osc)
     if own is not osc:
         return in_given_units(cycle_from(own, own.units.into(y0), max_arcs), osc, own)

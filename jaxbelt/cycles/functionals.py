@@ -1,8 +1,9 @@
-"""Functionals: one number of a cycle, to be swept, plotted, fitted or driven to a wanted value.
+"""Functionals: one number of a cycle, to be swept, plotted, fitted or designed.
 
-Each takes a `Cycle` and gives a scalar that is differentiable with respect to the oscillator's
+Each takes a `Cycle` and returns a scalar that is differentiable with respect to the oscillator's
 parameters, forward and reverse, and works on batches under `jax.vmap`. All quantities are
 dimensionless: times in units of 1/omega, energies in units of k L^2 where L is the unit of length.
+Where the status of the cycle is not OK they are NaN.
 """
 
 from collections.abc import Callable
@@ -25,14 +26,29 @@ _COORDINATES = {"x1": 0, "x2": 1}
 
 
 def period(cycle: Cycle) -> Array:
-    """Duration of one loop."""
+    """Duration of one loop.
+
+    Args:
+        cycle: A cycle, from `find_cycle` for example.
+
+    Returns:
+        The period, in dimensionless time tau.
+    """
     return _checked_cycle(cycle).period
 
 
 def stick_duration(cycle: Cycle, belt: int | None = None) -> Array:
     """Time per loop for which the mass sticks to a belt, summed over its stick phases.
 
-    belt: index of the belt; None: any belt. `ValueError` if there is no such belt.
+    Args:
+        cycle: A cycle, from `find_cycle` for example.
+        belt: Number of the belt; None: any belt.
+
+    Returns:
+        The duration, in dimensionless time tau.
+
+    Raises:
+        ValueError: If there is no such belt.
     """
     if belt is None:
         stuck = jnp.where(_is_stuck(cycle), 1.0, 0.0)
@@ -44,8 +60,15 @@ def stick_duration(cycle: Cycle, belt: int | None = None) -> Array:
 def slip_duration(cycle: Cycle, belt: int | None = None) -> Array:
     """Time per loop for which the mass touches a belt and slips on it.
 
-    belt: index of the belt; None: time for which the mass sticks to no belt. `ValueError` if there
-    is no such belt.
+    Args:
+        cycle: A cycle, from `find_cycle` for example.
+        belt: Number of the belt; None: time for which the mass sticks to no belt.
+
+    Returns:
+        The duration, in dimensionless time tau.
+
+    Raises:
+        ValueError: If there is no such belt.
     """
     if belt is None:
         return _checked_cycle(cycle).period - stick_duration(cycle)
@@ -56,27 +79,62 @@ def slip_duration(cycle: Cycle, belt: int | None = None) -> Array:
 
 
 def stick_fraction(cycle: Cycle, belt: int | None = None) -> Array:
-    """Fraction of a loop for which the mass sticks to a belt (None: to any), from 0 to 1."""
+    """Fraction of a loop for which the mass sticks to a belt.
+
+    Args:
+        cycle: A cycle, from `find_cycle` for example.
+        belt: Number of the belt; None: any belt.
+
+    Returns:
+        A number from 0 to 1.
+
+    Raises:
+        ValueError: If there is no such belt.
+    """
     return stick_duration(cycle, belt) / cycle.period
 
 
 def amplitude(cycle: Cycle, coordinate: str = "x1") -> Array:
-    """Half the difference of the largest and the smallest value of "x1" or "x2"."""
+    """Half the difference of the largest and the smallest value of a coordinate in a loop.
+
+    Args:
+        cycle: A cycle, from `find_cycle` for example.
+        coordinate: "x1" or "x2".
+
+    Returns:
+        The amplitude, dimensionless.
+    """
     values = _values(cycle, coordinate)
     return 0.5 * (jnp.max(values, axis=-1) - jnp.min(values, axis=-1))
 
 
 def peak(cycle: Cycle, coordinate: str = "x1") -> Array:
-    """Largest absolute value of "x1" or "x2" in a loop."""
+    """Largest absolute value of a coordinate in a loop.
+
+    Args:
+        cycle: A cycle, from `find_cycle` for example.
+        coordinate: "x1" or "x2".
+
+    Returns:
+        The peak, dimensionless.
+    """
     return jnp.max(jnp.abs(_values(cycle, coordinate)), axis=-1)
 
 
 def gap(cycle: Cycle, belt: int) -> Array:
-    """Signed distance in x2 from the cycle to the boundary r = 0 of a belt, nu/omega.
+    """Signed distance in x2 from the cycle to the boundary r = 0 of a belt, x2 = nu/omega.
 
-    Positive where the boundary lies outside of the cycle's range of x2, by how far; negative where
-    the cycle reaches across it, by how far; zero where it touches it, as all that stick to that
-    belt and do not cross it do.
+    Args:
+        cycle: A cycle, from `find_cycle` for example.
+        belt: Number of the belt.
+
+    Returns:
+        The distance. It is positive where the boundary lies outside of the cycle's range of x2,
+        negative where the cycle reaches across it, and zero where the cycle touches it, as it does
+        if it sticks to that belt and does not cross its boundary.
+
+    Raises:
+        ValueError: If there is no such belt.
     """
     belt = _belt_index(cycle, belt)
     osc = cycle.oscillator
@@ -88,18 +146,31 @@ def gap(cycle: Cycle, belt: int) -> Array:
 def energy_fed(cycle: Cycle) -> Array:
     """Work that the drives of the belts do in one loop: the sum of friction times belt velocity.
 
-    In a steady cycle it equals `energy_dissipated`. Negative parts occur: a belt can brake.
+    In a steady cycle it equals `energy_dissipated`. Some parts may be negative: a belt can brake.
+
+    Args:
+        cycle: A cycle, from `find_cycle` for example.
+
+    Returns:
+        The energy, dimensionless.
     """
     return _energies(_checked_cycle(cycle))[0]
 
 
 @announced("energy_dissipated")
 def energy_dissipated(cycle: Cycle) -> Array:
-    """Energy that damping and slipping contacts turn into heat in one loop."""
+    """Energy that damping and slipping contacts turn into heat in one loop.
+
+    Args:
+        cycle: A cycle, from `find_cycle` for example.
+
+    Returns:
+        The energy, dimensionless.
+    """
     return _energies(_checked_cycle(cycle))[1]
 
 
-#: What each functional is measured in: the name of one of `Units`, its `coordinate`, or a number.
+#: Quantity of each functional: the name of one of `Units`, its `coordinate`, or a number.
 MEASURED_IN: dict[Callable[..., Array], str] = {
     period: "time",
     stick_duration: "time",
@@ -147,7 +218,8 @@ def _energies_of(osc: Oscillator, chain: Chain, unknowns: Array) -> Array:
 
 
 def _powers(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
-    """Power [fed, dissipated] in a mode. A stuck contact holds the needed force, with sign turned.
+    """Power [fed, dissipated] in a mode. A stuck contact holds the needed force, with the sign
+    changed.
 
     Belts that are stuck together share one velocity, so only the sum of their forces counts.
     """

@@ -1,9 +1,9 @@
 """The shortest way between two curves, in any direction or along x2: `shortest_between`.
 
-x1 and x2 are monotone on every piece, for arcs end at extrema. So a part of a piece lies in the box
-between its ends, and two boxes bound the distance between what is in them from below and from
-above. Only pairs of parts that may be nearest are looked at more closely: the shortest way between
-them is where two equations hold (see `Meeting`), which Newton's method solves.
+x1 and x2 are monotone on every piece, as arcs end at extrema. So a part of a piece lies in the box
+between its ends, and two boxes bound the distance between their contents from below and from above.
+Newton's method solves for the shortest way (see `Meeting`) between those pairs of parts only
+that these bounds leave.
 """
 
 from typing import NamedTuple
@@ -15,30 +15,31 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..model.modes import ABOVE
+from ..model.modes import select
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import each, jit
+from ..numerics.newton import Equations, solution, solve
+from ..numerics.padding import filled_up, longer
 from .outlines import Outline, Pieces, place_on
 
 #: Parts of a piece; pairs of parts that are solved for in one batch, and pieces that are sampled.
 PARTS, PAIRS, PIECES = 16, 64, 32
-#: Newton steps within a pair of parts, and the longest, in parts.
-WITHIN, LONGEST_IN_PARTS = 16, 2.0
-#: The last step is no longer, as a fraction of the piece, nor is the error in x1 along x2 larger.
+#: Longest Newton step, as a fraction of a piece: two parts.
+LONGEST_PART = 2 / PARTS
+#: How far a solution may still move, as a fraction of a piece, and its largest error in x1 along
+#: x2.
 FOUND = 1e-9
-#: A solution that is so far beyond its parts is taken, too: in parts.
-BEYOND = 0.25
+#: A solution that is so far beyond its part is accepted, too, as a fraction of a piece.
+BEYOND = 0.25 / PARTS
 
 
 class Meeting(eqx.Module):
     """Where two curves are nearest to one another.
 
-    pieces: the number of the piece of each, [2]; fractions: where on it, [2]; fixed: whether that
-    is an end of the piece, where the curve may have a corner, [2].
-
-    With P on the first curve, Q on the second and d = P - Q two equations hold. In any direction: d
-    is normal to either curve, where that is not in a corner. Along x2: d1 = 0, and where neither is
-    in a corner, the curves are parallel; or both are in corners, where one curve ends in the other.
+    Attributes:
+        pieces: Number of the piece of each curve, [2].
+        fractions: Where on it, [2].
+        fixed: Whether that is an end of the piece, where the curve may have a corner, [2].
     """
 
     pieces: Array
@@ -46,114 +47,77 @@ class Meeting(eqx.Module):
     fixed: Array
 
 
-class _PieceParts(NamedTuple):
-    """Parts of pieces: the piece of each, where on it they begin, how long they are, both as
-    fractions, and the corners of their boxes, [parts, 2]."""
+class Normal(Equations):
+    """The two equations of a `Meeting` in its fractions.
 
+    With P on the first curve, Q on the second and d = P - Q: in any direction d is normal to both
+    curves; along x2 d1 = 0, and the curves are parallel. A fixed fraction is an equation alone and
+    replaces its own, along x2 the second one; two of them replace both.
+
+    given: oscillator; the two pieces, rows of `Pieces` stacked; the known fractions; fixed.
+    """
+
+    along_x2: bool = eqx.field(static=True)
+
+    def residual(self, given: tuple, z: Array) -> Array:
+        return self.linearized(given, z)[0]
+
+    def linearized(self, given: tuple, z: Array) -> tuple[Array, Array]:
+        osc, pieces, known, fixed = given
+        (p, q), (dp, dq), (ddp, ddq) = places_on(osc, pieces, z)
+        d, stay, unit = p - q, z - known, jnp.eye(2)
+        if not self.along_x2:
+            values, mixed = jnp.stack([d @ dp, -(d @ dq)]), -(dp @ dq)
+            rows = jnp.array([[dp @ dp + d @ ddp, mixed], [mixed, dq @ dq - d @ ddq]])
+            return jnp.where(fixed, stay, values), jnp.where(fixed[:, None], unit, rows)
+        parallel, row = _cross(dp, dq), jnp.stack([_cross(ddp, dq), _cross(dp, ddq)])
+        for k in (0, 1):
+            parallel, row = select(fixed[k], (stay[k], unit[k]), (parallel, row))
+        values = jnp.stack([d[0], parallel])
+        rows = jnp.stack([jnp.stack([dp[0], -dq[0]]), row])
+        return select(jnp.all(fixed), (stay, unit), (values, rows))
+
+
+def _cross(one: Array, other: Array) -> Array:
+    return one[0] * other[1] - one[1] * other[0]
+
+
+def places_on(osc: Oscillator, pieces: Pieces, fractions: Array) -> tuple[Array, Array, Array]:
+    """`place_on` for two pieces at a fraction each: three arrays [2, 2], a row for each piece."""
+    return lax.map(lambda row: place_on(osc, *row), (pieces, fractions))
+
+
+class Sampled(NamedTuple):
+    """A curve of a known oscillator in parts; see `in_parts`.
+
+    pieces: of the curve. piece: its number, of each part; begin: where on it the part begins, a
+    fraction; low, high: corners of the part's box, [parts, 2].
+    """
+
+    pieces: Pieces
     piece: np.ndarray
     begin: np.ndarray
-    width: np.ndarray
     low: np.ndarray
     high: np.ndarray
 
 
-class _Tries(NamedTuple):
-    """Where Newton's method begins: the parts of both curves, fractions and what is fixed, [n, 2]
-    each; least: no such way is shorter."""
-
-    parts: np.ndarray
-    fractions: np.ndarray
-    fixed: np.ndarray
-    least: np.ndarray
-
-
-class Sampled(NamedTuple):
-    """A curve where it is at one oscillator, and the parts of its pieces; see `sampled_curve`."""
-
-    pieces: Pieces
-    parts: _PieceParts
-
-
-def shortest_between(
-    osc: Oscillator, first: Sampled, second: Sampled, *, along_x2: bool
-) -> tuple[float, Meeting | None]:
-    """The shortest way from one curve to another, and where it is; inf and None if there is none.
-
-    along_x2: only ways between points with one x1. NaN and None where Newton's method finds none
-    that is as short as it is known to be.
-    """
-    parts = first.parts, second.parts
-    tries, limit = _tries_of(*parts, along_x2)
-    if not np.isfinite(limit):
-        return np.inf, None
-    best, where = np.inf, None
-    while len(tries.least):
-        now = _Tries(*(column[:PAIRS] for column in tries))
-        numbers = np.stack([parts[k].piece[now.parts[:, k]] for k in (0, 1)], axis=1)
-        fractions, lengths = _solved_for(osc, (first, second), now, numbers, along_x2)
-        shortest = int(np.argmin(lengths))
-        if lengths[shortest] < best:
-            best = float(lengths[shortest])
-            where = numbers[shortest], fractions[shortest], now.fixed[shortest]
-        left = np.arange(len(tries.least)) >= PAIRS
-        tries = _Tries(*(column[left & (tries.least < best)] for column in tries))
-    if where is None or best > limit * (1 + 1e-9):
-        return np.nan, None
-    return best, Meeting(*jax.device_put(where))
-
-
-# --- parts, and pairs of them that may be nearest -------------------------------------------------
-
-
-def sampled_curve(osc: Oscillator, outline: Outline) -> Sampled:
-    """The curve of an outline at a known oscillator."""
-    pieces = outline.pieces(osc)
-    return Sampled(pieces, _parts_of(osc, pieces))
-
-
-def end_of_way(osc: Oscillator, second: Sampled, meeting: Meeting) -> np.ndarray:
-    """Where a shortest way ends on its second curve, [2]."""
-    piece = jax.tree.map(lambda leaf: leaf[meeting.pieces[1]], second.pieces)
-    return np.asarray(_place_of_row(osc, piece, meeting.fractions[1]))
-
-
-@jit
-def _place_of_row(osc: Oscillator, piece: Pieces, fraction: Array) -> Array:
-    return place_on(osc, piece, fraction)[0]
-
-
-def sampled_point(osc: Oscillator, y: np.ndarray) -> Sampled:
-    """A state (x1, x2) as a curve."""
-    one, belts = jnp.ones(1), len(osc.belts)
-    place = jnp.asarray(np.array(y))[None]
-    pieces = Pieces(one, jnp.full((1, belts), float(ABOVE)), one[None], place, 0 * one, 0 * one)
-    zero = np.zeros(1)
-    return Sampled(pieces, _PieceParts(np.zeros(1, int), zero, zero, y[None], y[None]))
-
-
-def _parts_of(osc: Oscillator, pieces: Pieces) -> _PieceParts:
-    durations, lengths = np.asarray(pieces.durations), np.asarray(pieces.lengths)
-    is_point = (durations == 0) & (lengths == 0)
-    # Of a curve, not of a point, pieces without an extent are none.
-    used = np.ones(1, bool) if len(is_point) == 1 else ~is_point
-    states = []
-    for begin in range(0, len(used), PIECES):
-        rows = np.minimum(np.arange(begin, begin + PIECES), len(used) - 1)
-        states.append(_states_of(osc, jax.tree.map(lambda leaf, rows=rows: leaf[rows], pieces)))
-    states = np.concatenate(states)[: len(used)][used]
-    number = np.flatnonzero(used)
-    grid = np.linspace(0.0, 1.0, PARTS + 1)
-    ends = np.stack([states[:, :-1], states[:, 1:]])
-    low, high = ends.min(axis=0), ends.max(axis=0)
-    if len(is_point) == 1 and is_point[0]:
-        return _PieceParts(number, np.zeros(1), np.zeros(1), low[:, 0], high[:, 0])
-    return _PieceParts(
-        number.repeat(PARTS),
-        np.tile(grid[:-1], len(number)),
-        np.full(len(number) * PARTS, 1 / PARTS),
-        low.reshape(-1, 2),
-        high.reshape(-1, 2),
-    )
+def in_parts(osc: Oscillator, pieces: Pieces) -> Sampled:
+    """A curve of a known oscillator, cut into parts of its pieces."""
+    has_extent = (np.asarray(pieces.durations) != 0) | (np.asarray(pieces.lengths) != 0)
+    # A point is one piece, of one part.
+    is_point = not np.any(has_extent)
+    has_extent[0] |= is_point
+    numbers = np.flatnonzero(has_extent)
+    states = np.concatenate(
+        [
+            np.asarray(_states_of(osc, filled_up(pieces, numbers[i : i + PIECES], PIECES)))
+            for i in range(0, len(numbers), PIECES)
+        ]
+    )[: len(numbers)]
+    ends = np.stack([states[:, :-1], states[:, 1:]]).reshape(2, -1, 2)
+    begin = np.tile(np.arange(PARTS) / PARTS, len(numbers))
+    parts = numbers.repeat(PARTS), begin, ends.min(axis=0), ends.max(axis=0)
+    return Sampled(pieces, *(column[: 1 if is_point else None] for column in parts))
 
 
 @jit
@@ -167,166 +131,108 @@ def _states_of(osc: Oscillator, pieces: Pieces) -> Array:
     return lax.map(along, pieces)
 
 
-def _tries_of(one: _PieceParts, other: _PieceParts, along_x2: bool) -> tuple[_Tries, float]:
-    """What is to be tried, that which is likely to be nearest first, and a length that the shortest
-    way does not exceed, inf where there is none."""
+def shortest_between(
+    osc: Oscillator, first: Sampled, second: Sampled, *, along_x2: bool
+) -> tuple[float, np.ndarray, Meeting | None]:
+    """The shortest way from one curve to another.
+
+    Args:
+        osc: A known oscillator.
+        first: Curve where the way begins.
+        second: Curve where it ends.
+        along_x2: Whether it has to keep x1.
+
+    Returns:
+        Its length, its end, [2], and where it is. inf, NaN and None if there is none; NaN, NaN and
+        None where Newton's method finds none that is as short as it is known to be.
+    """
+    curves = first, second
+    parts, fractions, fixed, least, limit = _tries_of(first, second, along_x2)
+    best, end, where = np.inf, np.full(2, np.nan), None
+    left = np.arange(len(least))
+    while left.size:
+        now, left = left[:PAIRS], left[PAIRS:]
+        number = np.stack([curves[k].piece[parts[now, k]] for k in (0, 1)], axis=1)
+        begin = np.stack([curves[k].begin[parts[now, k]] for k in (0, 1)], axis=1)
+        pieces = [filled_up(curves[k].pieces, number[:, k], PAIRS) for k in (0, 1)]
+        found = _solved_for(osc, *pieces, *filled_up((fractions, fixed), now, PAIRS), along_x2)
+        z, to, d, moves = (np.asarray(one)[: now.size] for one in found)
+        # Where a piece ends above the other curve, as on an edge, rounding decides on which side.
+        inside = np.maximum(begin - BEYOND, -FOUND) <= z
+        inside &= z <= np.minimum(begin + 1 / PARTS + BEYOND, 1 + FOUND)
+        good = np.all(inside | fixed[now], axis=1) & (moves < FOUND)
+        good &= (np.abs(d[:, 0]) < FOUND) | (not along_x2)
+        lengths = np.where(good, np.abs(d[:, 1]) if along_x2 else np.hypot(*d.T), np.inf)
+        row = int(np.argmin(lengths))
+        if lengths[row] < best:
+            best, end = float(lengths[row]), to[row]
+            where = number[row], np.clip(z[row], 0.0, 1.0), fixed[now[row]]
+        left = left[least[left] < best]
+    if where is None or best > limit * (1 + 1e-9):
+        return np.nan if np.isfinite(limit) else np.inf, np.full(2, np.nan), None
+    return best, end, Meeting(*jax.device_put(where))
+
+
+def _tries_of(one: Sampled, other: Sampled, along_x2: bool) -> tuple[np.ndarray, ...]:
+    """Guesses for Newton's method, likely ones first.
+
+    Returns the parts of both curves, fractions, and which are fixed, [n, 2] each; lower bounds of
+    the lengths, [n]; and an upper bound of the shortest way, inf if there is none.
+    """
     apart = one.low[:, None] - other.high, other.low - one.high[:, None]
     least = np.maximum(np.maximum(*apart), 0.0)
-    most = np.maximum(other.high - one.low[:, None], one.high[:, None] - other.low)
+    most = -np.minimum(*apart)
     if along_x2:
         meets = least[..., 0] == 0
         least, most = (np.where(meets, size[..., 1], np.inf) for size in (least, most))
     else:
         least, most = (np.hypot(size[..., 0], size[..., 1]) for size in (least, most))
-    limit = float(np.min(most, initial=np.inf))
+    limit = np.min(most, initial=np.inf)
     pairs = np.argwhere((least <= limit) & np.isfinite(least))
     pairs = pairs[np.argsort(most[pairs[:, 0], pairs[:, 1]], kind="stable")]
-    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    choices = [_choices(parts, pairs[:, k]) for k, parts in enumerate((one, other))]
-    for s, s_fixed, s_there in choices[0]:
-        for t, t_fixed, t_there in choices[1]:
-            possible = s_there & t_there
-            fractions = np.stack([s, t], axis=1)[possible]
-            fixed = np.stack([s_fixed, t_fixed], axis=1)[possible]
-            found.append((np.flatnonzero(possible), fractions, fixed))
-    rows, fractions, fixed = (np.concatenate(column) for column in zip(*found, strict=True))
-    order = np.argsort(rows, kind="stable")
-    rows = rows[order]
-    bound = least[pairs[rows, 0], pairs[rows, 1]]
-    return _Tries(pairs[rows], fractions[order], fixed[order], bound), limit
-
-
-def _choices(parts: _PieceParts, rows: np.ndarray) -> list[tuple[np.ndarray, ...]]:
-    """Where on its piece a point of each of these parts may be: somewhere in the part, or at an end
-    of the piece. A fraction, whether it is fixed, and whether that is a choice."""
-    begin, width = parts.begin[rows], parts.width[rows]
-    none, whole = np.zeros(len(rows), bool), np.ones(len(rows), bool)
-    return [
-        (begin + 0.5 * width, none, width > 0),
-        (np.zeros(len(rows)), whole, begin == 0),
-        (np.ones(len(rows)), whole, begin + width == 1),
-    ]
-
-
-# --- the equations --------------------------------------------------------------------------------
-
-
-def places_on(osc: Oscillator, first: Pieces, second: Pieces, fractions: Array):
-    """`place_on` for a row of each curve, at two fractions, [2]: three arrays [2, 2], of which the
-    first rows are of the first curve."""
-    steps = max(piece.mesh.shape[-1] for piece in (first, second))
-    # Steps that are added are of length zero. One program does both.
-    first, second = (
-        eqx.tree_at(lambda p: p.mesh, one, jnp.pad(one.mesh, (0, steps - one.mesh.shape[-1])))
-        for one in (first, second)
-    )
-    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), first, second)
-    return lax.map(lambda row: place_on(osc, *row), (both, fractions))
-
-
-def equations_of(places: tuple[Array, Array, Array], stay: Array, fixed: Array, along_x2: bool):
-    """The two equations of a `Meeting`, [2], and their derivatives by the fractions, [2, 2].
-
-    places: what `places_on` gives. A fraction that is fixed is an equation by itself, along x2 in
-    the place of the second one, in any direction in that of its own; fixed: which are, [2]; stay:
-    how far they are from where they are to be, [2].
-    """
-    (p, q), (dp, dq), (ddp, ddq) = places
-    d, unit = p - q, jnp.eye(2)
-    if along_x2:
-        second = dp[0] * dq[1] - dp[1] * dq[0]
-        row = jnp.stack([ddp[0] * dq[1] - ddp[1] * dq[0], dp[0] * ddq[1] - dp[1] * ddq[0]])
-        for k in (0, 1):
-            second = jnp.where(fixed[k], stay[k], second)
-            row = jnp.where(fixed[k], unit[k], row)
-        rows = jnp.stack([jnp.stack([dp[0], -dq[0]]), row])
-        both = jnp.all(fixed)
-        return jnp.where(both, stay, jnp.stack([d[0], second])), jnp.where(both, unit, rows)
-    values, mixed = jnp.stack([d @ dp, -(d @ dq)]), -(dp @ dq)
-    diagonal = dp @ dp + d @ ddp, dq @ dq - d @ ddq
-    rows = jnp.stack([jnp.stack([diagonal[0], mixed]), jnp.stack([mixed, diagonal[1]])])
-    return jnp.where(fixed, stay, values), jnp.where(fixed[:, None], unit, rows)
-
-
-def solved_step(values: Array, rows: Array) -> Array:
-    """The step of Newton's method for two equations."""
-    (a, b), (c, d) = rows
-    determinant = a * d - b * c
-    inverse = jnp.stack([jnp.stack([d, -b]), jnp.stack([-c, a])])
-    return -(inverse @ values) / jnp.where(determinant == 0, jnp.nan, determinant)
-
-
-def _solved_for(
-    osc: Oscillator,
-    curves: tuple[Sampled, Sampled],
-    tries: _Tries,
-    numbers: np.ndarray,
-    along_x2: bool,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Fractions where the equations hold, [n, 2], and how long the ways are: inf where there is
-    none in these parts. numbers: of the pieces, [n, 2]."""
-    n = len(numbers)
-    rows = np.minimum(np.arange(PAIRS), n - 1)
-    columns = [(curve.parts.begin, curve.parts.width) for curve in curves]
-    begin, width = (
-        np.stack([columns[k][c][tries.parts[:, k]] for k in (0, 1)], axis=1)[rows] for c in (0, 1)
-    )
-    both = [
-        jax.tree.map(lambda leaf, k=k: leaf[numbers[rows, k]], curve.pieces)
-        for k, curve in enumerate(curves)
-    ]
-    start, fixed = tries.fractions[rows], tries.fixed[rows]
-    found = _newton_in_parts(osc, *both, *jax.device_put((start, fixed, width)), along_x2)
-    fractions, d, last = (np.asarray(one) for one in found)
-    low, high = begin - BEYOND * width, begin + (1 + BEYOND) * width
-    # Where a piece ends above the other curve, as on an edge, rounding says on which side of it.
-    inside = np.maximum(low, -FOUND) <= fractions
-    inside &= fractions <= np.minimum(high, 1.0 + FOUND)
-    good = np.all(inside | fixed, axis=1) & (last < FOUND)
-    if along_x2:
-        good &= np.abs(d[:, 0]) < FOUND
-    lengths = np.abs(d[:, 1]) if along_x2 else np.hypot(d[:, 0], d[:, 1])
-    return np.clip(fractions[:n], 0.0, 1.0), np.where(good, lengths, np.inf)[:n]
+    # Each point is in the middle of its part at first, or fixed at an end of its piece.
+    begins = [curve.begin[pairs[:, k]] for k, curve in enumerate((one, other))]
+    guesses = [np.stack([b + 0.5 / PARTS, 0 * b, 0 * b + 1], axis=1) for b in begins]
+    chosen = [np.stack([b == b, b == 0, b == 1 - 1 / PARTS], axis=1) for b in begins]
+    row, i, j = np.nonzero(chosen[0][:, :, None] & chosen[1][:, None, :])
+    fractions = np.stack([guesses[0][row, i], guesses[1][row, j]], axis=1)
+    fixed = np.stack([i > 0, j > 0], axis=1)
+    return pairs[row], fractions, fixed, least[pairs[row, 0], pairs[row, 1]], limit
 
 
 @jit
-def _newton_in_parts(
-    osc: Oscillator,
-    first: Pieces,
-    second: Pieces,
-    start: Array,
-    fixed: Array,
-    width: Array,
-    along_x2: bool,
+def _solved_for(
+    osc: Oscillator, first: Pieces, second: Pieces, start: Array, fixed: Array, along_x2
 ):
-    """Newton's method for each row: fractions, d there, and the length of the last step."""
+    """For each row: fractions, the end of the way there, d, and how far fractions still move."""
 
-    def one(first, second, start, fixed, width):
-        def improve(_, state):
-            fractions, _ = state
-            places = places_on(osc, first, second, fractions)
-            values, rows = equations_of(places, fractions - start, fixed, along_x2)
-            step = solved_step(values, rows)
-            longest = jnp.max(jnp.abs(step) / jnp.where(width > 0, width, 1.0))
-            step = step * jnp.minimum(1.0, LONGEST_IN_PARTS / jnp.where(longest > 0, longest, 1.0))
-            # Arcs do not go far beyond where they end.
-            new = jnp.clip(fractions + step, -0.1, 1.1)
-            return jnp.where(fixed, start, new), jnp.max(jnp.abs(step))
+    def one(first, second, start, fixed):
+        pieces = _both_pieces(first, second)
+        found = solve(Normal(along_x2), (osc, pieces, start, fixed), start, longest=LONGEST_PART)
+        p, q = places_on(osc, pieces, found.z)[0]
+        return found.z, q, p - q, found.unsettled
 
-        fractions, last = lax.fori_loop(0, WITHIN, improve, (start, jnp.inf))
-        p, q = places_on(osc, first, second, fractions)[0]
-        return fractions, p - q, last
-
-    return each(one)(first, second, start, fixed, width)
+    return each(one)(first, second, start, fixed)
 
 
-# --- where the way is shortest, as a function of the oscillator -----------------------------------
+def _both_pieces(*two: Pieces) -> Pieces:
+    """Two rows of `Pieces`, stacked. Steps that are added are of length zero."""
+    steps = max(one.mesh.shape[-1] for one in two)
+    padded = [
+        eqx.tree_at(lambda p: p.mesh, one, longer(one.mesh, steps, axis=-1, fill=0.0))
+        for one in two
+    ]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *padded)
 
 
 class ShortestWay(eqx.Module):
     """The shortest way between two outlines, known where it is at one oscillator.
 
-    first, second: the outlines; meeting: see `Meeting`; along_x2: whether it is along x2.
+    Attributes:
+        first: Outline on which it begins.
+        second: Outline on which it ends.
+        meeting: Where that is.
+        along_x2: Whether it is along x2.
     """
 
     first: Outline
@@ -335,20 +241,18 @@ class ShortestWay(eqx.Module):
     along_x2: bool = eqx.field(static=True)
 
     def ends(self, osc: Oscillator) -> tuple[Array, Array]:
-        """Where it begins and ends, [2] each, with first derivatives by every parameter."""
+        """Beginning and end of the way, [2] each, with first derivatives by every parameter."""
         return _ends_of(osc, self)
 
 
 @jit
 def _ends_of(osc: Oscillator, way: ShortestWay) -> tuple[Array, Array]:
+    meeting = lax.stop_gradient(way.meeting)
     first, second = (
-        jax.tree.map(lambda leaf, k=k: leaf[way.meeting.pieces[k]], outline.pieces(osc))
+        jax.tree.map(lambda leaf, k=k: leaf[meeting.pieces[k]], outline.pieces(osc))
         for k, outline in enumerate((way.first, way.second))
     )
-    known, fixed = lax.stop_gradient((way.meeting.fractions, way.meeting.fixed))
-    places = places_on(osc, first, second, known)
-    values, rows = equations_of(places, jnp.zeros(2), fixed, way.along_x2)
-    # The derivative of the implicit function: one step with a matrix that is kept.
-    late = solved_step(values, lax.stop_gradient(rows))
-    begin, end = places[0] + late[:, None] * lax.stop_gradient(places[1])
+    given = osc, _both_pieces(first, second), meeting.fractions, meeting.fixed
+    fractions = solution(Normal(way.along_x2), given, meeting.fractions)
+    begin, end = places_on(osc, given[1], fractions)[0]
     return begin, end

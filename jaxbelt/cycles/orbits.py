@@ -1,6 +1,6 @@
-"""Orbits followed until a loop repeats: how the signature of a cycle, and a guess of it, are found.
+"""Orbits followed until a loop repeats, for the signature of a cycle and a guess of it.
 
-An orbit is followed arc by arc, see `arcs`, every extremum the end of one.
+An orbit is followed arc by arc, see `arcs`; every extremum ends an arc.
 """
 
 from collections.abc import Callable
@@ -16,13 +16,13 @@ from ..model.modes import (
     STUCK,
     Mode,
     capacity,
-    edges,
     first_of,
     force_rounding,
     mode_acceleration,
     mode_of,
     select,
     zone,
+    zone_ends,
 )
 from ..model.oscillator import Oscillator, has_possible_numbers
 from ..model.rest import settles
@@ -34,24 +34,24 @@ from ..results import Status
 from .chains import Loop
 from .settling import AT_REST, has_repeated
 
-#: Arcs that an orbit is followed for before it is given up: some 100 loops.
+#: Arcs for which an orbit is followed before it is given up: some 100 loops.
 MOST_ARCS = 1024
-#: The stride of `Graded` with which every arc is good to 1e-12; with STRIDE it is to some 1e-8.
+#: The stride of `Graded` with which every arc is accurate to 1e-12; with STRIDE it is to some 1e-8.
 FINE_STRIDE = 0.05
-#: The speed down to which a fine orbit is followed that creeps.
+#: The speed down to which a creeping fine orbit is followed.
 CREEPING_SPEED = 1e-6
-#: So near to an equilibrium such an orbit ends, or nearer.
+#: Largest distance from an equilibrium at which such an orbit ends.
 SEEN_AT_REST = 1e-2
 
 
 class Orbit(eqx.Module):
-    """The arcs of an orbit, in rows up to `count`: entry, duration, codes, and what ended each.
+    """The arcs of an orbit, in rows up to `count`: entry, duration, codes, and end event.
 
     tops: x1 where an arc ended in a maximum of x1, else NaN. repeats: row of the top that the last
-    one repeats, else -1. y, code, signs: where it stands now. top: that of the last arc;
-    top_before: the last one, NaN where there was none. low, low_before: the smallest x1 since then,
-    and between that and the one before. sticks: whether it has stuck since. repellers: x1 of the
-    pseudo-foci to which no loop shrinks.
+    one repeats, else -1. y, code, signs: present state. top: that of the last arc; top_before: the
+    last top, NaN where there was none. low, low_before: the smallest x1 since then, and between
+    that and the one before. sticks: whether it has stuck since. repellers: x1 of the pseudo-foci to
+    which no loop shrinks.
     """
 
     entries: Array
@@ -122,8 +122,8 @@ def _next_arc(
     repeats = lax.cond(any_lane(is_top), repeated, lambda: jnp.asarray(-1))
     repeats = jnp.where(loops, repeats, -1)
     shrinks = amplitude < orbit.top_before - orbit.low_before
-    # An orbit that sticks is on a cycle, however small: it repeats exactly.
-    # Around a pseudo-focus a loop is as wide as its velocity squared.
+    # An orbit that sticks is on a cycle, however small: it repeats exactly. Around a pseudo-focus a
+    # loop is as wide as its velocity squared.
     repelled = jnp.any((orbit.low <= orbit.repellers) & (orbit.repellers <= y_end[0]))
     resting = is_top & ~orbit.sticks & loops & shrinks & (amplitude < AT_REST) & ~repelled
     resting = (resting | settles(osc, end.mode, *end.y)) & ~end.forever
@@ -158,8 +158,10 @@ def _followed_while(
     stride: float | Array = STRIDE,
     reach: float | Array = jnp.inf,
 ) -> Orbit:
-    """Arc after arc, from no arcs, as long as there is room and `going` says so; an arc ends, too,
-    where |x1| or |x2| comes to `reach`."""
+    """Arc after arc, from no arcs, as long as there is room and `going` holds.
+
+    An arc also ends where |x1| or |x2| reaches `reach`.
+    """
 
     def unfinished(orbit):
         return going(orbit) & (orbit.count < orbit.tops.size)
@@ -167,7 +169,7 @@ def _followed_while(
     def turn(state):
         number, orbit = state
         row, after = _next_arc(osc, orbit, stride, reach)
-        # Of the columns, long ones, one row is written, the same of all lanes in a batch.
+        # Of the columns, long ones, one row is written, the same in all lanes of a batch.
         own = unfinished(orbit)
         columns = {name: getattr(orbit, name) for name in row}
         written = {
@@ -202,10 +204,10 @@ def _to_top_from(osc: Oscillator, start: Orbit) -> Orbit:
 def _finely_from(osc: Oscillator, start: Orbit, reach: Array) -> Orbit:
     def going(orbit):
         near = jnp.max(jnp.abs(orbit.y)) < reach
-        # Where it comes to rest is known before it is there.
+        # The place of rest is known before the orbit is there.
         away = jnp.hypot(orbit.y[0] - place_of_rest(osc, orbit), orbit.y[1])
         on_the_way = (orbit.status == Status.EQUILIBRIUM) & (away > SEEN_AT_REST)
-        # An arc that takes too many steps creeps to a node, on a boundary say, and goes on.
+        # An arc that takes too many steps creeps to a node, on a boundary for example, and goes on.
         creeps = (orbit.status == Status.NOT_SETTLED) & (jnp.abs(orbit.y[1]) > CREEPING_SPEED)
         return (~orbit.done | on_the_way | creeps) & near
 
@@ -227,16 +229,21 @@ def follow_from(osc: Oscillator, mode: Mode, y0: Array, status: Array, budget: i
 
 
 def follow_to_top(osc: Oscillator, y0: Array, budget: int) -> tuple[Orbit, Array]:
-    """The orbit from y0 until a top, or it comes to rest; and x1 at the top, NaN where it has come
-    to none. Of an oscillator that is known to be possible, or that is one reversed in time."""
+    """The orbit from y0 until a top, or it comes to rest; and x1 at the top, NaN where there is
+    none.
+
+    The oscillator has to be possible, or one that is reversed in time.
+    """
     osc, y0 = lax.stop_gradient((osc, y0))
     orbit = _to_top_from(osc, _beginning(osc, y0, budget, jnp.asarray(True)))
     return orbit, orbit.top
 
 
 def follow_finely(osc: Oscillator, mode: Mode, y0: Array, budget: int, reach: Array) -> Orbit:
-    """The orbit that leaves y0 in a mode, as in `follow`, but every arc to 1e-12, and nearly to
-    where it rests, as long as |x1| and |x2| are < reach."""
+    """The orbit that leaves y0 in a mode, as in `follow`, with every arc accurate to 1e-12.
+
+    It is followed nearly to its place of rest, as long as |x1| and |x2| are < reach.
+    """
     osc, mode, y0 = lax.stop_gradient((osc, mode, y0))
     start = _standing(osc, mode, y0, jnp.asarray(Status.OK.value), budget)
     return _settled_or_not(_finely_from(osc, start, reach))
@@ -248,7 +255,8 @@ def place_of_rest(osc: Oscillator, orbit: Orbit) -> Array:
     held = jnp.sum(jnp.where(last, orbit.entries[:, 0], 0.0))
     mode = mode_of(orbit.code)
     fixed = mode_acceleration(osc, mode, jnp.zeros(()), jnp.zeros(()))
-    # That of the mode's field lies beyond an edge where the orbit circles a pseudo-focus there.
+    # The fixed point of the mode's field lies beyond an edge where the orbit circles a pseudo-focus
+    # there.
     lower, upper = zone(osc, mode)
     fixed = jnp.where(fixed < lower, lower, jnp.where(fixed > upper, upper, fixed))
     ways = (Status.STUCK_FOREVER, Status.PSEUDO_FOCUS, Status.EQUILIBRIUM)
@@ -262,7 +270,7 @@ def _settled_or_not(orbit: Orbit) -> Orbit:
 
 
 def _beginning(osc: Oscillator, y0: Array, budget: int, possible: Array) -> Orbit:
-    """An orbit that stands at y0, with room for as many arcs as the budget."""
+    """An orbit at y0, with room for as many arcs as the budget."""
     rests = begins_at_rest(osc, y0[0], y0[1])
     focus = at_focus(osc, y0[0], y0[1])
     status = jnp.where(rests, Status.EQUILIBRIUM.value, Status.OK.value)
@@ -297,9 +305,9 @@ def _standing(osc: Oscillator, mode: Mode, y0: Array, status: Array, budget: int
 
 
 def last_loop(orbit: Orbit) -> tuple[Array, Array]:
-    """(first row, number of rows) of the loop that repeats; it begins at the end of a stick phase.
+    """(first row, number of rows) of the loop that repeats.
 
-    That of the longest one, if there are several; if there is none, at the top. Rows are to be
+    It begins at the end of the longest stick phase; if there is none, at the top. Rows are to be
     taken modulo the number, see `loop_of`.
     """
     rows = jnp.arange(orbit.durations.size)
@@ -337,14 +345,14 @@ def first_loop(osc: Oscillator, x1: Array, distance: Array, size: int):
 
 
 def before_stick_ends(osc: Oscillator, belt: int | Array) -> Array:
-    """States stuck to a belt where stick phases end, one for each zone between contact edges.
+    """States stuck to a belt where stick phases end, one for each zone between contact edges,
+    [zones, 2].
 
-    Shortly before slip onset; or, where the zone ends first, on the edge. NaN where neither is, or
-    the belt does not touch. [zones, 2].
+    Shortly before slip onset; or, where the zone ends first, on the edge. NaN where neither exists,
+    or the belt does not touch.
     """
     v = jnp.stack([one.velocity for one in osc.belts])[belt] / osc.omega
-    positions, end = jnp.sort(jnp.stack(edges(osc))), jnp.full(1, jnp.inf)
-    lower, upper = jnp.concatenate([-end, positions]), jnp.concatenate([positions, end])
+    lower, upper = zone_ends(osc)
     mode = contact(osc, lower, v, rightward=True)
     onset, held = onset_position(osc, mode), capacity(osc, mode)
     before, ahead = select(v > 0, (lower, upper), (upper, lower))

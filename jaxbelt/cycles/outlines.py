@@ -1,15 +1,14 @@
 """Curves of the phase plane in smooth pieces, as functions of the oscillator: `Outline`.
 
-A cycle, a separatrix and a segment of equilibria are such curves. An outline keeps what is discrete
-of one, the modes and the ends of its arcs, which do not change where the oscillator does a little;
-where the curve is follows from the oscillator, and so do its derivatives: of a cycle those of the
-shooting equations, of a separatrix those of its arcs one after another, each of which ends where
-the guard of its end vanishes.
+A cycle, a separatrix and a segment of equilibria are such curves. An outline keeps the discrete
+data of a curve, the modes and the ends of its arcs, which do not change when the oscillator changes
+a little; the place of the curve follows from the oscillator, and so do its derivatives: for a cycle
+those of the shooting equations, for a separatrix those of its arcs one after another, each of which
+ends where the guard of its end vanishes.
 
-A point of a curve has the number of its piece and a fraction, from 0 where the piece begins to 1.
+A point of a curve is given by the number of its piece and a fraction, from 0 at the beginning of
+the piece to 1.
 """
-
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,40 +17,49 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..checks import pick
 from ..model.equilibria import equilibria
 from ..model.modes import (
     ABOVE,
     STUCK,
     Mode,
     capacity,
-    edges,
     force_rounding,
     mode_acceleration,
     mode_of,
+    zone_ends,
 )
 from ..model.oscillator import Oscillator
 from ..model.transitions import contact
 from ..motion.arcs import Ends
-from ..numerics.compiling import jit, power_of_two
-from .backwards import BackwardCycle
+from ..motion.integrators import density
+from ..numerics.compiling import each, jit, power_of_two
+from ..numerics.padding import filled_up
+from .backwards import BackwardCycle, moved_in_time
 from .chains import Chain, Loop
-from .creeping import FEWEST, cut_finely
 from .cycle import Cycle
-from .separatrices import Separatrix, tangencies
-from .shooting import end_guard, flow, meshed, solve_closed
+from .separatrices import Separatrix, end_points, places_along
+from .shooting import closed, end_guard, flow, meshed
 
-#: Integration steps in an arc of a separatrix, or in a piece of one.
-STEPS = 16
+#: Integration steps in an arc of a separatrix, or in a piece of one; largest integral of the
+#: density of steps over a piece, for which these suffice.
+STEPS, PIECE = 16, 8.0
+#: Pieces that are cut off each arc in one compiled call.
+CUT_AT_ONCE = 32
+#: Least number of rows of the arrays of arcs and pieces, so that few shapes are compiled.
+FEWEST = 16
 
 
 class Pieces(eqx.Module):
     """Pieces of curves, a row each: arcs of orbits, or straight lines along the x1 axis.
 
-    way: 1, or -1 for an arc of the oscillator reversed in time, the x2 of which is reversed, too;
-    codes: contact codes, [pieces, belts]; mesh: steps as fractions, [pieces, steps]; entries: where
-    it begins, (x1, x2) or (x1, -x2), [pieces, 2]; durations: of the arc, 0 of a line; lengths: of
-    the line, 0 of an arc.
+    Attributes:
+        way: 1, or -1 for an arc of the oscillator reversed in time, the x2 of which is reversed,
+            too.
+        codes: Contact codes, [pieces, belts].
+        mesh: Steps as fractions, [pieces, steps].
+        entries: Where it begins, (x1, x2) or (x1, -x2), [pieces, 2].
+        durations: Duration of the arc, 0 for a line.
+        lengths: Length of the line, 0 for an arc.
     """
 
     way: Array
@@ -62,18 +70,17 @@ class Pieces(eqx.Module):
     lengths: Array
 
 
-def moved_in_time(osc: Oscillator, way: Array) -> Oscillator:
-    """The oscillator, or for way = -1 that reversed in time, see `backwards`."""
-    return eqx.tree_at(
-        lambda o: [o.damping, *(b.velocity for b in o.belts), *(b.load for b in o.belts)],
-        osc,
-        replace_fn=lambda leaf: leaf * way,
-    )
+def straight(osc: Oscillator, x1: Array, to: Array, x2: Array) -> Pieces:
+    """A straight line along x1, or a point; belts that do not touch need no computation."""
+    one, away = jnp.ones(1), jnp.full((1, len(osc.belts)), float(ABOVE))
+    return Pieces(one, away, one[None], jnp.stack([x1, x2])[None], 0 * one, (to - x1) * one)
 
 
 def place_on(osc: Oscillator, piece: Pieces, fraction: Array) -> tuple[Array, Array, Array]:
-    """A point (x1, x2) of a piece, one row of `Pieces`, and its first and second derivatives by the
-    fraction, [2] each."""
+    """A point (x1, x2) of a piece, and its first and second derivatives by the fraction.
+
+    piece: one row of `Pieces`.
+    """
     moving, mode = moved_in_time(osc, piece.way), mode_of(piece.codes)
     y = flow(moving, piece.codes, piece.mesh, piece.entries, fraction * piece.durations)
 
@@ -85,77 +92,54 @@ def place_on(osc: Oscillator, piece: Pieces, fraction: Array) -> tuple[Array, Ar
     _, bend = jax.jvp(field, (y,), (slope,))
     turned = jnp.stack([jnp.ones(()), piece.way])
     line = jnp.stack([piece.lengths, jnp.zeros(())])
-    duration = piece.durations
-    return (
-        turned * y + fraction * line,
-        duration * turned * slope + line,
-        duration**2 * turned * bend,
-    )
+    rate = piece.durations * turned
+    return turned * y + fraction * line, rate * slope + line, rate * piece.durations * bend
 
 
 class Outline(eqx.Module):
     """A curve that moves with the oscillator; see the module."""
 
     def pieces(self, osc: Oscillator) -> Pieces:
-        """Where its pieces are, with derivatives by every parameter."""
+        """Its pieces, with derivatives by every parameter."""
         raise NotImplementedError
 
 
-class Rest(Outline):
-    """Where the mass can rest at one place: a point, or the line of a segment.
+class StraightOutline(Outline):
+    """A straight line along x1, or a point.
 
-    first, last: numbers of its rows in `equilibria`.
+    Attributes:
+        belt: Belt on whose boundary it lies, see `jumps`; -1: where the mass can rest.
+        first: Row of `jumps`, or of `equilibria`, where it begins.
+        last: Row where it ends.
     """
 
+    belt: int = eqx.field(static=True)
     first: int = eqx.field(static=True)
     last: int = eqx.field(static=True)
 
     def pieces(self, osc: Oscillator) -> Pieces:
-        rests = equilibria(osc)
-        x1 = rests.x1_lower[self.first]
-        return Pieces(
-            way=jnp.ones(1),
-            # Of belts that do not touch there is nothing to compute.
-            codes=jnp.full((1, len(osc.belts)), float(ABOVE)),
-            mesh=jnp.ones((1, 1)),
-            entries=jnp.stack([x1, jnp.zeros_like(x1)])[None],
-            durations=jnp.zeros(1),
-            lengths=(rests.x1_upper[self.last] - x1)[None],
-        )
-
-
-class JumpOutline(Outline):
-    """Of the boundary of a belt whose static limit exceeds mu(0) a piece where a mass that is stuck
-    is held, though the friction of one that slips is too weak for that: see `jumps`.
-
-    upper: whether it is the one where the needed force, in the belt's direction, is the largest.
-    """
-
-    belt: int = eqx.field(static=True)
-    zone: int = eqx.field(static=True)
-    upper: bool = eqx.field(static=True)
-
-    def pieces(self, osc: Oscillator) -> Pieces:
-        lower, upper, velocity = _jumps_of(osc, jnp.asarray(np.array(self.belt)))
-        x1, to = (ends[int(self.upper)][self.zone] for ends in (lower, upper))
-        return Pieces(
-            way=jnp.ones(1),
-            codes=jnp.full((1, len(osc.belts)), float(ABOVE)),
-            mesh=jnp.ones((1, 1)),
-            entries=jnp.stack([x1, velocity])[None],
-            durations=jnp.zeros(1),
-            lengths=(to - x1)[None],
-        )
+        if self.belt < 0:
+            rests = equilibria(osc)
+            lower, upper, x2 = rests.x1_lower, rests.x1_upper, jnp.zeros(())
+        else:
+            lower, upper, x2 = jumps(osc, jnp.asarray(np.array(self.belt)))
+        return straight(osc, lower[self.first], upper[self.last], x2)
 
 
 @jit
-def _jumps_of(osc: Oscillator, belt: Array) -> tuple[Array, Array, Array]:
-    """Of the boundary of a belt, in each zone between contact edges, the x1 between which a mass is
-    held though friction at rest, mu(0), would not do, [2, zones] each, where that pulls to the left
-    and to the right; NaN where there are none; and the x2 of the boundary."""
+def jumps(osc: Oscillator, belt: Array) -> tuple[Array, Array, Array]:
+    """Pieces of the boundary of a belt that divide motions.
+
+    Where the static limit of a belt exceeds mu(0) a mass that comes to its boundary from one side
+    is held up to the static limit, and one that is on the other side slips away. There is one such
+    piece where the needed force pulls to the left, and one where it pulls to the right.
+
+    Returns:
+        The least and the largest x1 of each, [2 * zones], of all zones first of those to the left,
+        NaN where there is none; and x2 of the boundary.
+    """
     v = jnp.stack([one.velocity for one in osc.belts])[belt] / osc.omega
-    positions, end = jnp.sort(jnp.stack(edges(osc))), jnp.full(1, jnp.inf)
-    low, high = jnp.concatenate([-end, positions]), jnp.concatenate([positions, end])
+    low, high = zone_ends(osc)
     stuck = contact(osc, low, v, rightward=True)
     slips = Mode(tuple(jnp.where(code == STUCK, 1.0, code) for code in stuck.codes))
     zero = jnp.zeros_like(low)
@@ -163,28 +147,11 @@ def _jumps_of(osc: Oscillator, belt: Array) -> tuple[Array, Array, Array]:
     kinetic = jnp.abs(mode_acceleration(osc, slips, zero, v) - middle)
     held = capacity(osc, stuck)
     exists = (jnp.stack(stuck.codes)[belt] == STUCK) & (held - kinetic > force_rounding(middle))
-    lower = [jnp.clip(x1, low, high) for x1 in (middle - held, middle + kinetic)]
-    upper = [jnp.clip(x1, low, high) for x1 in (middle - kinetic, middle + held)]
-    there = [exists & (first < last) for first, last in zip(lower, upper, strict=True)]
-    lower, upper = (
-        jnp.stack([jnp.where(one, x1, jnp.nan) for one, x1 in zip(there, ends, strict=True)])
-        for ends in (lower, upper)
-    )
+    lower = jnp.clip(jnp.stack([middle - held, middle + kinetic]), low, high)
+    upper = jnp.clip(jnp.stack([middle - kinetic, middle + held]), low, high)
+    there = exists & (lower < upper)
+    lower, upper = (jnp.where(there, x1, jnp.nan).reshape(-1) for x1 in (lower, upper))
     return lower, upper, v
-
-
-def jumps(osc: Oscillator) -> list[tuple[int, int, bool]]:
-    """The pieces of boundaries that part motions themselves: belt, zone between contact edges, and
-    whether it is the upper one of the two there.
-
-    Where the static limit of a belt exceeds mu(0) a mass that comes to its boundary from one side
-    is held up to the static limit, and one that is on the other side slips away.
-    """
-    found = []
-    for belt in range(len(osc.belts)):
-        lower = np.asarray(_jumps_of(osc, jnp.asarray(np.array(belt)))[0])
-        found += [(belt, int(zone), bool(up)) for up, zone in np.argwhere(np.isfinite(lower))]
-    return found
 
 
 class ClosedOutline(Outline):
@@ -194,59 +161,55 @@ class ClosedOutline(Outline):
     unknowns: Array
     way: float = eqx.field(static=True)
 
+    @classmethod
+    def of(cls, cycle: Cycle) -> "ClosedOutline":
+        """The outline of a cycle with status OK."""
+        if isinstance(cycle, BackwardCycle):
+            return cls(cycle.backwards_chain, cycle.backwards_unknowns, -1.0)
+        return cls(cycle.chain, cycle.unknowns, 1.0)
+
     def pieces(self, osc: Oscillator) -> Pieces:
-        moving = moved_in_time(osc, jnp.asarray(self.way))
-        z = _solved_anew(moving, self.chain, self.unknowns)
+        z = _closed_chain(moved_in_time(osc, self.way), self.chain, self.unknowns)
         none = jnp.zeros(len(z))
         return Pieces(none + self.way, self.chain.codes, self.chain.mesh, z[:, :2], z[:, 2], none)
 
 
-@jit
-def _solved_anew(osc: Oscillator, chain: Chain, z: Array) -> Array:
-    return solve_closed(osc, chain, z)[0]
+_closed_chain = jit(closed)
 
 
 class OpenOutline(Outline):
     """A stable separatrix, followed backwards from its point.
 
-    chain: its arcs, or pieces of them: one that ends by nothing ("unused") goes on in the next, and
-    the last one may be cut off so; durations: theirs. origin: of which sort its point is and
-    numbers that say which: "edge", its number; "segment", the row of `equilibria`, and 0 for its
-    lower and 1 for its upper end; "boundary", the belt, and the zone between edges; "corner", the
-    belt, and the edge.
+    Attributes:
+        chain: Its arcs, or pieces of them. One without an end event ("unused") continues in the
+            next, and the last one may be cut off.
+        durations: Their durations.
+        origin: Row of its point among `end_points`.
     """
 
     chain: Chain
     durations: Array
-    origin: tuple[Any, ...] = eqx.field(static=True)
+    origin: int = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, osc: Oscillator, separatrix: Separatrix) -> "OpenOutline":
+        """The outline of a stable separatrix."""
+        away = np.abs(np.asarray(end_points(osc)) - np.asarray(separatrix.point)).sum(axis=1)
+        moving = moved_in_time(osc, -1.0)
+        loop = _cut_finely(moving, separatrix.arcs)
+        return cls(_chain_of(moving, loop), loop.durations, int(np.nanargmin(away)))
 
     def pieces(self, osc: Oscillator) -> Pieces:
-        way = jnp.asarray(-1.0)
-        point = self._point(osc) * jnp.array([1.0, -1.0])
-        moving = moved_in_time(osc, way)
+        point = end_points(osc)[self.origin] * jnp.array([1.0, -1.0])
+        moving = moved_in_time(osc, -1.0)
         entries, durations = _one_after_another(moving, self.chain, self.durations, point)
         none = jnp.zeros(len(durations))
         return Pieces(none - 1.0, self.chain.codes, self.chain.mesh, entries, durations, none)
 
-    def _point(self, osc: Oscillator) -> Array:
-        sort, *numbers = self.origin
-        if sort == "boundary":
-            belt, zone = numbers
-            return tangencies(osc, jnp.asarray(np.array(belt)))[0][zone]
-        if sort == "corner":
-            belt, number = numbers
-            return jnp.stack([edges(osc)[number], osc.belts[belt].velocity / osc.omega])
-        if sort == "edge":
-            x1 = edges(osc)[numbers[0]]
-        else:
-            rests = equilibria(osc)
-            x1 = (rests.x1_lower, rests.x1_upper)[numbers[1]][numbers[0]]
-        return jnp.stack([x1, jnp.zeros_like(x1)])
-
 
 @jit
 def _one_after_another(osc: Oscillator, chain: Chain, durations: Array, y: Array):
-    """Entries and durations of the arcs of a chain that is open, from where it begins.
+    """Entries and durations of the arcs of an open chain, from its beginning.
 
     Known durations are good to rounding. One Newton step gives each its first derivative.
     """
@@ -268,49 +231,52 @@ def _one_after_another(osc: Oscillator, chain: Chain, durations: Array, y: Array
     return lax.scan(through, y, (chain.codes, chain.ends, chain.mesh, durations))[1]
 
 
-# --- outlines of what a portrait tells ------------------------------------------------------------
+@jit
+def _chain_of(osc: Oscillator, loop: Loop) -> Chain:
+    return meshed(osc, loop, STEPS)[0]
 
 
-def outline_of_cycle(cycle: Cycle) -> ClosedOutline:
-    """The outline of a cycle with status OK."""
-    if isinstance(cycle, BackwardCycle):
-        return ClosedOutline(cycle.backwards_chain, cycle.backwards_unknowns, -1.0)
-    return ClosedOutline(cycle.chain, cycle.unknowns, 1.0)
+def _cut_finely(osc: Oscillator, loop: Loop) -> Loop:
+    """Arcs in a row, those that need more than STEPS steps cut into pieces.
 
-
-def outline_of_separatrix(osc: Oscillator, separatrix: Separatrix) -> OpenOutline:
-    """The outline of a stable separatrix."""
-    arcs = cut_finely(moved_in_time(osc, jnp.asarray(-1.0)), separatrix.arcs)
-    count = len(arcs.durations)
-    rooms = np.arange(power_of_two(count, FEWEST))
-    rows, own = np.minimum(rooms, count - 1), rooms < count
-    loop = pick(arcs, rows)
-    ends = np.where(own, np.asarray(loop.ends), Ends(len(osc.belts)).unused)
-    durations = np.where(own, np.asarray(loop.durations), 0.0)
-    loop = eqx.tree_at(lambda a: (a.ends, a.durations), loop, jax.device_put((ends, durations)))
-    return OpenOutline(_backward_chain(osc, loop), loop.durations, _origin_of(osc, separatrix))
+    A piece that is not the last of its arc has no end event ("unused"). Rows that pad it have no
+    duration. An arc may creep: to a node on the boundary of a belt, for example, near which it
+    stays for a hundred times as long as it moved.
+    """
+    count = len(loop.ends)
+    padded = filled_up(loop, np.arange(count), power_of_two(count, FEWEST))
+    entries, left = map(np.array, (padded.entries, padded.durations))
+    left[count:] = 0.0
+    idle = np.flatnonzero(left[:count] == 0)
+    found = [(idle, entries[idle], left[idle])]
+    while np.any(left > 0):
+        # Arcs that are done take no step.
+        cut = _first_pieces(osc, padded.codes, *jax.device_put((entries, left)))
+        ts, states = map(np.asarray, cut)
+        begins = np.concatenate([entries[:, None], states[:, :-1]], axis=1)
+        durations = np.diff(ts, prepend=0.0, axis=1)
+        arcs, columns = np.nonzero(durations > 0)
+        found.append((arcs, begins[arcs, columns], durations[arcs, columns]))
+        entries, left = states[:, -1], left - ts[:, -1]
+    rows, begins, durations = (np.concatenate(column) for column in zip(*found, strict=True))
+    order = np.argsort(rows, kind="stable")
+    is_last = np.append(np.diff(rows[order]) != 0, True)
+    size = np.arange(power_of_two(len(order), FEWEST))
+    own, at = size < len(order), np.minimum(size, len(order) - 1)
+    rows, ends = rows[order[at]], np.asarray(loop.ends)
+    ends = np.where(own & is_last[at], ends[rows], Ends(len(osc.belts)).unused)
+    durations = np.where(own, durations[order[at]], 0.0)
+    codes = np.asarray(loop.codes)[rows]
+    return Loop(*jax.device_put((codes, ends, begins[order[at]], durations)))
 
 
 @jit
-def _backward_chain(osc: Oscillator, loop: Loop) -> Chain:
-    return meshed(moved_in_time(osc, jnp.asarray(-1.0)), loop, STEPS)[0]
+def _first_pieces(osc: Oscillator, codes: Array, entries: Array, durations: Array):
+    def of_arc(codes, y, duration):
+        def wanted(y):
+            return density(osc, mode_of(codes), *y)
 
+        marks = PIECE * jnp.arange(1.0, CUT_AT_ONCE + 1)
+        return places_along(osc, codes, y, duration, wanted, marks)
 
-def _origin_of(osc: Oscillator, separatrix: Separatrix) -> tuple[Any, ...]:
-    x1, x2 = np.asarray(separatrix.point).tolist()
-    if x2 != 0:
-        for belt in range(len(osc.belts)):
-            points = np.asarray(tangencies(osc, jnp.asarray(np.array(belt)))[0])
-            zones = np.flatnonzero(np.all(points == [x1, x2], axis=1))
-            if zones.size:
-                return "boundary", belt, int(zones[0])
-    places = np.asarray(edges(osc))
-    if x2 != 0:
-        levels = [float(belt.velocity / osc.omega) for belt in osc.belts]
-        return "corner", levels.index(x2), int(np.flatnonzero(places == x1)[0])
-    rests = equilibria(osc)
-    for end, ends in enumerate((rests.x1_lower, rests.x1_upper)):
-        rows = np.flatnonzero((np.asarray(ends) == x1) & (np.asarray(rests.kind) == 2))
-        if rows.size and x1 not in places:
-            return "segment", int(rows[0]), end
-    return "edge", int(np.flatnonzero(places == x1)[0])
+    return each(of_arc)(codes, entries, durations)

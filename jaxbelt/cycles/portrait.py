@@ -1,10 +1,10 @@
-"""Everything that there is at one oscillator: `portrait` and what it returns, `Portrait`.
+"""The complete phase portrait of one oscillator: `portrait` and its result, `Portrait`.
 
-The plane is told by a few sets: where orbits end, and what parts those that end in different
-places. With dry friction they are (see `returns` and `separatrices` for why there are no others)
-equilibria, attracting cycles, unstable cycles, and separatrices of points on contact edges, of ends
-of segments and of boundaries with a jump. Nothing here needs bifurcations, so it stands among the
-cycles.
+A few sets determine the plane: those where orbits end, and those that divide orbits that end in
+different places. With dry friction these are (see `returns` and `separatrices` for why there are no
+others) equilibria, attracting cycles, unstable cycles, and separatrices of points on contact edges,
+of ends of segments and of boundaries with a jump. Nothing here needs bifurcations, so it belongs to
+the cycles.
 """
 
 from collections.abc import Sequence
@@ -21,11 +21,13 @@ from ..checks import outside_of_traces, pick
 from ..model.equilibria import Equilibria, EquilibriumKind, equilibria
 from ..model.events import signature_name
 from ..model.modes import edges
-from ..model.oscillator import Oscillator, check_oscillator
+from ..model.oscillator import Oscillator, check_oscillator, refuse_clock
 from ..model.own_units import OwnOscillator, in_given_units, in_own_units, quantity
+from ..numerics.compiling import compiled_beside
 from ..results import Status, describe, draw
 from ..tables import table_of
-from .cycle import Cycle, warn_of_extrapolation
+from .chains import SIZES, blank_loop
+from .cycle import Cycle, polish, warn_of_extrapolation
 from .returns import Returns, reach_of
 from .separatrices import Separatrix, TracedSeparatrix, branches
 
@@ -34,36 +36,37 @@ if TYPE_CHECKING:
 
 #: A top is on a cycle that is no farther away than this, relative to the distance from the origin.
 ON_CYCLE = 1e-5
-#: An equilibrium as near to an edge is on it.
+#: An equilibrium as near to an edge as this is on it.
 ON_EDGE = 1e-9
-#: Separatrices are followed beyond the reach, from where they may come back into it.
+#: Separatrices are followed up to this multiple of the reach, as they may come back into it.
 TRACED = 3.0
 #: An orbit without an end that gets so near to a point of rest tends to it.
 CREEPING = 1e-3
 
 
 class Portrait(eqx.Module):
-    """Everything that there is at one oscillator; what `portrait` returns.
+    """All equilibria, cycles and separatrices of one oscillator; what `portrait` returns.
 
-    - oscillator: whose portrait it is.
-    - equilibria: all of them, saddles included, see `Equilibria`.
-    - cycles: the attracting ones; unstable: the unstable ones; tuples of `Cycle`, by their largest
-      x1.
-    - separatrices: a tuple of `Separatrix`, by their points; the stable ones bound basins, as
-      unstable cycles do.
-    - escapes: whether starts far out go to infinity.
-    - reach: the bounds of what was looked at, `|x1|` and `|x2|` < reach. No cycle is farther out,
-      as far as a bound is known, which it is not where damping is 0. For damping < 0 with friction
-      that grows with the speed loops beyond were seen to grow, or shrink, as they do at infinity.
-    - gaps: intervals (from, to) of x1 at rest in which it is not told whether cycles pass, [gaps,
-      2]; those of a continuum of closed orbits, which are neither attracting nor unstable, too; and
-      (reach, inf) where there is a cycle farther out.
-    - status: OK, or INCOMPLETE where there is a gap, or where an equilibrium on a contact edge is a
-      stable node: the orbit that comes to it in its fast direction is a separatrix, too, and is not
-      given; or where a stable separatrix is unsettled, or was left within reach.
+    The basin of a start follows from its place: see `table` for all numbers, `plot` for the
+    picture.
 
-    Starts tell which basin they are in by where they lie: see `table` for all numbers, `plot` for
-    the picture.
+    Attributes:
+        oscillator: The oscillator.
+        equilibria: All of them, saddles included, see `Equilibria`.
+        cycles: The attracting cycles, a tuple of `Cycle`, by their largest x1.
+        unstable: The unstable cycles, likewise.
+        separatrices: A tuple of `Separatrix`, by their points; the stable ones bound basins, as
+            unstable cycles do.
+        escapes: Whether starts far out go to infinity.
+        reach: Bound of the search, `|x1|` and `|x2|` < reach. No cycle is farther out, as far as a
+            bound is known, which it is not where damping is 0. For damping < 0 with friction that
+            grows with the speed loops beyond were seen to grow, or shrink, as they do at infinity.
+        gaps: Intervals (from, to) of x1 at rest in which it is not known whether cycles pass,
+            [gaps, 2]; also those of a continuum of closed orbits, which are neither attracting nor
+            unstable; and (reach, inf) where there is a cycle farther out.
+        status: OK; or INCOMPLETE where there is a gap, where an equilibrium on a contact edge is a
+            stable node (the orbit that comes to it in its fast direction is a separatrix, too, and
+            is missing), or where a stable separatrix is unsettled, or ends within the reach.
     """
 
     oscillator: Oscillator
@@ -77,7 +80,7 @@ class Portrait(eqx.Module):
     status: Array
 
     def table(self) -> "pandas.DataFrame":
-        """A row for each equilibrium, cycle and separatrix: what it is, stable or not, where.
+        """Returns a row for each equilibrium, cycle and separatrix.
 
         Columns: what, number (among its sort), kind (an `EquilibriumKind`, the events of a cycle,
         or where a separatrix leads to or comes from), stable, neutral (of an equilibrium; else
@@ -116,7 +119,14 @@ class Portrait(eqx.Module):
         return table_of(rows)
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw it into the axes `ax`, which are returned; None: new ones."""
+        """Draws the portrait.
+
+        Args:
+            ax: Axes; None makes new ones.
+
+        Returns:
+            The axes.
+        """
         return draw(self, ax)
 
     def __repr__(self) -> str:
@@ -154,15 +164,21 @@ def _row(what: str, number: int, kind: str, stable: Any, ys: np.ndarray, **more:
 def portrait(osc: Oscillator) -> Portrait:
     """All equilibria, attracting and unstable cycles, and separatrices of an oscillator.
 
-    osc: `Oscillator` with any friction laws, belts and contact intervals, of any damping. See
-    `Portrait` for what comes back. Cycles smaller than 1e-5 of the oscillator's own size, and those
-    that go less than 1e-7 of it to the right of a contact edge at which the mass can rest, are not
-    told from equilibria.
+    Cycles smaller than 1e-5 of the oscillator's own size, and those that go less than 1e-7 of it to
+    the right of a contact edge at which the mass can rest, are not distinguished from equilibria.
+    Not for `jax.jit`, `jax.vmap` and derivatives: the numbers decide how much is computed.
 
-    For one known oscillator, outside of `jax.jit`, `jax.vmap` and derivatives: how much there is
-    decides what is computed. `ValueError` names an argument that is impossible, or traced.
+    Args:
+        osc: A known `Oscillator`, with any friction laws, belts, contact intervals and damping.
+
+    Returns:
+        The `Portrait`.
+
+    Raises:
+        ValueError: If an argument is impossible or traced; the message names it.
     """
     check_oscillator(osc)
+    refuse_clock(osc, "portrait", "jb.simulate from several starts")
     own = in_own_units(osc)
     found = in_given_units(_portrait(own), osc, own)
     warn_of_extrapolation((*found.cycles, *found.unstable), depth=5)
@@ -171,7 +187,10 @@ def portrait(osc: Oscillator) -> Portrait:
 
 def _portrait(osc: OwnOscillator) -> Portrait:
     points = equilibria(osc)
-    found, map_ = branches_and_returns(osc, points)
+    # Its cycles are polished when the returns of orbits are known.
+    loop, ok = blank_loop(SIZES[0], len(osc.belts)), jnp.asarray(Status.OK.value)
+    with compiled_beside("portrait", osc, [lambda: polish(osc, loop, ok)]):
+        found, map_ = branches_and_returns(osc, points)
     reach = map_.reach
     cycles = tuple(cycle for cycle in map_.cycles if abs(float(cycle.multiplier)) < 1)
     unstable = tuple(cycle for cycle in map_.cycles if float(cycle.multiplier) > 1)
@@ -180,8 +199,8 @@ def _portrait(osc: OwnOscillator) -> Portrait:
         _named(branch, map_, points, unstable if branch.stable else cycles) for branch in found
     )
     short = any(one.stable and _falls_short(one, reach) for one in separatrices)
-    told = not len(gaps) and not _has_node_on_edge(osc, points) and not short
-    status = Status.OK if told else Status.INCOMPLETE
+    complete = not len(gaps) and not _has_node_on_edge(osc, points) and not short
+    status = Status.OK if complete else Status.INCOMPLETE
     return Portrait(
         oscillator=osc,
         equilibria=points,
@@ -207,7 +226,7 @@ def branches_and_returns(
 
 
 def _falls_short(one: Separatrix, reach: float) -> bool:
-    """Whether a separatrix was left before it came to where it is from or leads to."""
+    """Whether a separatrix ends before it comes to its origin or its destination."""
     is_inside = bool(jnp.max(jnp.abs(one.ys)) < reach)
     return one.end == "unsettled" or (one.end == "outside" and is_inside)
 
@@ -224,10 +243,10 @@ def _has_node_on_edge(osc: Oscillator, points: Equilibria) -> bool:
 def _named(
     branch: TracedSeparatrix, map_: Returns, points: Equilibria, cycles: Sequence[Cycle]
 ) -> Separatrix:
-    """The separatrix, with where it leads to or comes from; cycles: those that may be that."""
+    """The separatrix, with its destination or origin; cycles: possible ones."""
     end, to = _end_of(branch, map_, points, cycles)
     if branch.stable and end == "equilibrium" and points.stable[to]:
-        # But for rounding none comes from where all ends that is near; of a segment it may.
+        # Up to rounding no orbit comes from where all orbits nearby end; from a segment it may.
         if int(points.kind[to]) != EquilibriumKind.SEGMENT:
             end, to = "unsettled", -1
     ts, ys = jax.device_put((branch.ts, branch.ys))
@@ -250,8 +269,10 @@ def _end_of(branch: TracedSeparatrix, map_: Returns, points: Equilibria, cycles)
 def _approached(
     branch: TracedSeparatrix, map_: Returns, points: Equilibria, cycles
 ) -> tuple[str, int]:
-    """What the tops of an orbit tend to that was followed until they hardly moved: the next such
-    cycle, or the end of their interval, in the direction in which they go."""
+    """The limit of the tops of an orbit that was followed until they hardly moved.
+
+    It is the next such cycle in the direction in which the tops move, or the end of their interval.
+    """
     if branch.status != Status.OK and (to := _creeping_to(branch, points)) >= 0:
         return "equilibrium", to
     if not len(branch.tops):
@@ -278,8 +299,10 @@ def _approached(
 
 
 def _creeping_to(branch: TracedSeparatrix, points: Equilibria) -> int:
-    """The number of the point of rest that an orbit has come so near to that it will not end: a
-    node on an edge, or on the boundary of a belt at rest, takes for ever; -1 if there is none."""
+    """Number of the point of rest that an orbit approaches for ever, or -1.
+
+    A node on an edge, or on the boundary of a belt at rest, takes for ever.
+    """
     ends = np.stack([np.asarray(points.x1_lower), np.asarray(points.x1_upper)])
     away = np.min(np.hypot(ends - branch.y[0], branch.y[1]), axis=0)
     away[np.asarray(points.kind) == EquilibriumKind.SADDLE] = np.inf

@@ -10,8 +10,8 @@ a state (x1, 0) at which the mass is pulled to the left; the map leads from a to
   the rests, edges and segments on the axis. So P(a) > b, or P(b) < a, shows that no cycle has its
   top between a and b. The tops are divided until each interval is free in this sense, brackets a
   change of sign of P(x1) - x1, or is short.
-- The map is flat where orbits stick, and steep beside. A cycle that sticks comes by a place where a
-  stick phase ends; the tops that follow those are divided at, too.
+- The map is flat where orbits stick, and steep beside. A cycle that sticks passes a place where a
+  stick phase ends; the intervals are divided at the tops that follow these places, too.
 - It jumps at tops whose orbits end in a point of an edge that nothing draws in from one side, see
   `separatrices`. A jump over the diagonal is no cycle.
 """
@@ -46,41 +46,41 @@ from .settling import AT_REST
 TOPS_AT_ONCE = 64
 #: Room for the arcs of one loop.
 LOOP_ROOM = SIZES[-1]
-#: Tops for each factor of ten of the distance from where an interval begins, and from its end.
+#: Tops for each factor of ten of the distance from the beginning of an interval, and from its end.
 PER_DECADE = 16
-#: Intervals shorter than this fraction of the distance from where they begin are divided only where
-#: the growth of loops changes by more than the second number, and none below the third.
+#: Intervals shorter than SHORT, as a fraction of the distance from where they begin, are divided
+#: only where the growth of loops changes by more than UNEVEN, and none below SHORTEST.
 SHORT, UNEVEN, SHORTEST = 1e-2, 0.05, 1e-5
-#: Distances from the tops that follow stick phases, and jumps, begin with this one.
+#: Smallest distance from the tops that follow stick phases, and jumps.
 CLOSEST = 1e-10
-#: Cycles around a pseudo-focus are looked for down to this width; their height is larger. Of tops
-#: that are nearer to the edge than that rounding says whether loops grow: they leave no gap.
+#: Smallest width of cycles around a pseudo-focus that are searched; their height is larger. For
+#: tops nearer to the edge rounding decides whether loops grow: they leave no gap.
 AT_FOCUS = 1e-7
-#: So far to both sides, over the distance from where its interval begins, it is seen whether a
-#: narrow gap is one of rounding.
+#: Distance at which both sides of a narrow gap are examined, over the distance from where its
+#: interval begins.
 AROUND = 0.3
-#: Tops at most, in search of all cycles.
+#: Largest number of tops in the search for all cycles.
 MOST_TOPS = 20_000
 #: Tops that return to themselves to this fraction do so up to the errors of orbits.
 RETURNED = 1e-8
-#: A bracket is divided into 64, at most so often; if it then is one of a jump, the map changes
-#: by more than this there.
+#: A bracket is divided into 64, at most DIVISIONS times; if it then contains a jump, the map
+#: changes by more than JUMP there.
 DIVISIONS, JUMP = 6, 1e-6
-#: Where loops grow by less than the first fraction the errors of the map are looked at, at so many
-#: tops on either side, which differ by the second fraction: nearer to one another they have the
-#: same errors. Beside an edge these count up to the last distance, in units of 1 + |x1|.
+#: Where loops grow by less than HARDLY_GROWS the errors of the map are estimated from EACH_WAY tops
+#: on either side, which differ by the fraction SIDEWAYS: nearer to one another they have the same
+#: errors. Beside an edge these count up to UNRESOLVED, in units of 1 + |x1|.
 HARDLY_GROWS, EACH_WAY, SIDEWAYS, UNRESOLVED = 0.1, 8, 1e-2, 1e-4
 #: Values of a function within so many standard deviations of its errors are rounding.
 CERTAIN = 5.0
-#: The error of the map, relative to the top; by so much over 1 - multiplier is a fixed point off.
+#: Error of the map, relative to the top; a fixed point is off by this over 1 - multiplier.
 MAP_ERROR = 3e-7
 #: Cycles with a multiplier as near to 1 are parts of a continuum of closed orbits.
 NEUTRAL = 1e-9
-#: Intervals of tops as short as this, relative to where they are, are rounding.
+#: Intervals of tops as short as this, relative to their place, are rounding.
 NARROWEST = 1e-12
-#: Tops that differ by less, relative to where they are, are one but for rounding of the map.
+#: Tops that differ by less, relative to their place, are equal up to rounding of the map.
 ONE_TOP = 1e-11
-#: The largest distance from the origin that is looked at, where no bound is known.
+#: Largest distance from the origin that is searched, where no bound is known.
 FARTHEST = 1e4
 #: The growth of loops is as it is far out if it is off by less than this fraction.
 AS_EXPECTED = 0.25
@@ -95,8 +95,11 @@ class Bracket(NamedTuple):
 
 @jit
 def _next_tops(osc: Oscillator, starts: Array) -> tuple[Array, Loop]:
-    """The top that follows each start, [starts, 2]; or x1 where the orbit comes to rest; inf where
-    it does not come back; NaN where that is not told. And the way there, as if it were closed."""
+    """The top that follows each start, [starts, 2], and the way there as if it were closed.
+
+    In place of a top x1 where the orbit comes to rest; inf where it does not come back; NaN where
+    that is not known.
+    """
 
     def one(start):
         orbit, top = follow_to_top(osc, start, LOOP_ROOM)
@@ -121,15 +124,15 @@ class Returns:
 
     reach: no cycle, and no orbit that comes to rest, has a top beyond it, or such are not known.
     intervals: of tops, (from, to) each, from left to right. cycles: all cycles found, each once, in
-    order of their tops. gaps: intervals of tops, (from, to) each, of which it is not told whether
-    there are cycles in them, such as a continuum of closed orbits. escapes: whether orbits from the
+    order of their tops. gaps: intervals of tops, (from, to) each, in which it is not known whether
+    there are cycles, such as a continuum of closed orbits. escapes: whether orbits from the
     outermost tops go to infinity.
     """
 
     def __init__(
         self, osc: Oscillator, rests: Equilibria, reach: float, special: Sequence[float]
     ) -> None:
-        """rests: where the mass can rest; special: tops near which the map may be steep."""
+        """rests: states of rest; special: tops near which the map may be steep."""
         self.osc = osc
         self.gaps: list[tuple[float, float]] = []
         self._brackets: list[Bracket] = []
@@ -170,9 +173,9 @@ class Returns:
     def _is_rounding(self, gap: tuple[float, float], rests: Equilibria) -> bool:
         """Whether no cycle passes a gap: the map changes its sign there by rounding.
 
-        So it is next to the edge from which an interval begins; at the edge where one ends; nearer
-        to a fixed point on an edge than loops of which it is known that they grow as its rate says;
-        and where a gap is as narrow as rounding, but loops grow within it as they do outside.
+        That is the case next to the edge from which an interval begins; at the edge where one ends;
+        nearer to a fixed point on an edge than loops that are known to grow as its rate says; and
+        where a gap is as narrow as rounding, but loops grow within it as they do outside.
         """
         (low, high), *_ = [*(i for i in self.intervals if i[0] <= gap[0] < i[1]), (np.nan, np.nan)]
         away, narrow = gap[1] - low, NARROWEST * (1 + abs(gap[1]))
@@ -192,8 +195,11 @@ class Returns:
         return bool(within * outside > 0)
 
     def _grow_as_at_rest(self, low: float, high: float, away: float, rests: Equilibria) -> bool:
-        """Whether loops around a fixed point, at which an interval begins, grow or shrink from a
-        distance on as its rate says: the first of them that are more than rounding."""
+        """Whether loops around a fixed point, at which an interval begins, grow or shrink as its
+        rate says.
+
+        From a distance on; the first loops that are more than rounding decide.
+        """
         near = np.abs(np.asarray(rests.x1) - low) < NARROWEST * (1 + abs(low))
         near &= np.asarray(rests.kind) == EquilibriumKind.FIXED_POINT
         rate = np.asarray(rests.rate)[near & ~np.asarray(rests.neutral)]
@@ -202,11 +208,11 @@ class Returns:
         if not (rate.size and beyond.size):
             return False
         rise = self(beyond) - beyond
-        told = np.flatnonzero(np.abs(rise) > CERTAIN * self._errors_at(beyond, low))
-        return bool(told.size) and bool(rise[told[0]] * rate[0] > 0)
+        known = np.flatnonzero(np.abs(rise) > CERTAIN * self._errors_at(beyond, low))
+        return bool(known.size) and bool(rise[known[0]] * rate[0] > 0)
 
     def _errors_at(self, tops: np.ndarray, low: float) -> np.ndarray:
-        """The errors of the map, as tops beside tell them."""
+        """Errors of the map, estimated from tops beside."""
         steps = SIDEWAYS * np.arange(-EACH_WAY, EACH_WAY + 1)
         beside = tops[:, None] + (tops[:, None] - low) * steps
         around = self(beside.ravel()).reshape(beside.shape) - beside
@@ -242,7 +248,7 @@ class Returns:
     # --- dividing -------------------------------------------------------------------------------
 
     def _search(self, low: float, high: float) -> None:
-        """Find the brackets of cycles with their tops in an interval."""
+        """Finds the brackets of cycles with their tops in an interval."""
         tops = self._first_tops(low, high)
         returns = self(tops)
         while tops.size < MOST_TOPS:
@@ -281,7 +287,8 @@ class Returns:
         return (0.5 * (a + b))[~free & ~changes & wide & np.isfinite(width)]
 
     def _collect(self, tops: np.ndarray, returns: np.ndarray, low: float) -> None:
-        """Take the changes of sign, the tops that return to themselves, and what is not known."""
+        """Collects the changes of sign, the tops that return to themselves, and unresolved
+        intervals."""
         rise = returns - tops
         zero = np.abs(rise) <= np.maximum(RETURNED * np.minimum(1.0, tops - low), RETURNED**2)
         zero = self._with_rounding(tops, rise, zero, low)
@@ -296,8 +303,8 @@ class Returns:
                 (float(tops[max(first - 1, 0)]), float(tops[min(last + 1, tops.size - 1)]))
             )
         self._hits += tops[zero & ~closed].tolist()
-        told = ~zero & ~np.isnan(returns)
-        signs, where = np.sign(rise[told]), tops[told]
+        known = ~zero & ~np.isnan(returns)
+        signs, where = np.sign(rise[known]), tops[known]
         for i in np.flatnonzero(np.diff(signs)):
             if not np.any(closed & (where[i] < tops) & (tops < where[i + 1])):
                 self._brackets.append(Bracket(float(where[i]), float(where[i + 1])))
@@ -305,17 +312,17 @@ class Returns:
     def _with_rounding(
         self, tops: np.ndarray, rise: np.ndarray, zero: np.ndarray, low: float
     ) -> np.ndarray:
-        """Which rises of the map are zero, those added that are no larger than its errors beside a
-        change of their sign.
+        """Which rises of the map are zero, including those within its errors beside a change of
+        their sign.
 
         Near an edge that pushes the mass back these errors are large: x1 there is known to its
         rounding, and so x2 only to that rounding times the push, divided by x2.
         """
         zero, asked = zero.copy(), np.abs(rise) > HARDLY_GROWS * (tops - low)
         while True:
-            told = np.flatnonzero(~zero & ~np.isnan(rise))
-            changes = np.flatnonzero(np.diff(np.sign(rise[told])))
-            new = np.unique([told[changes], told[changes + 1]])
+            known = np.flatnonzero(~zero & ~np.isnan(rise))
+            changes = np.flatnonzero(np.diff(np.sign(rise[known])))
+            new = np.unique([known[changes], known[changes + 1]])
             new = new[~asked[new]]
             if not new.size:
                 return zero
@@ -337,8 +344,8 @@ class Returns:
         tops = np.unique(np.linspace(low, high, TOPS_AT_ONCE + 2)[1:-1])
         tops = np.concatenate([[low], tops[(low < tops) & (tops < high)], [high]])
         rise = self(tops) - tops
-        told = ~np.isnan(rise)
-        tops, rise = tops[told], rise[told]
+        known = ~np.isnan(rise)
+        tops, rise = tops[known], rise[known]
         found: list[Cycle] = []
         for i, j, is_rounding in _changes_of_sign(rise):
             a, b, before, after = tops[i], tops[j], rise[i], rise[j]
@@ -363,8 +370,11 @@ class Returns:
         return _if_at_home(solved(self.osc, pick(loops, 0)), top, high - low)
 
     def _cycle_behind(self, low: float, top: float) -> Cycle | None:
-        """The cycle with its top there, as it is backwards, or None: then the map jumps between low
-        and there, or, where no top comes backwards, that is not told."""
+        """The cycle with its top there, solved backwards, or None.
+
+        None means that the map jumps between low and there, or, where no top comes backwards, that
+        it is not known.
+        """
         behind = reversed_in_time(self.osc)
         (before,), (loops,) = self._after(behind, np.array([[top, 0.0]]))
         if np.isnan(before):
@@ -376,7 +386,7 @@ class Returns:
 
 
 def _if_at_home(cycle: Cycle, top: float, width: float) -> Cycle | None:
-    """A cycle that was solved for from a top, if it is one, and where it was looked for."""
+    """A cycle that was solved for from a top, if it exists and is at the expected place."""
     if int(cycle.status) != Status.OK:
         return None
     x1, x2, _ = np.ptp(np.asarray(cycle.unknowns), axis=0)
@@ -388,11 +398,11 @@ def _if_at_home(cycle: Cycle, top: float, width: float) -> Cycle | None:
 
 
 def _with_tops_apart(cycles: Sequence[Cycle]) -> list[Cycle]:
-    """Of cycles in order of their tops, of which several next to one another attract, or do not,
-    with one top up to rounding, the first: between two fixed points of that sort is another one.
+    """Cycles in order of their tops, without those that rounding has multiplied.
 
-    Where a saddle's orbit returns to it, rounding of the map, which rises there like a square root,
-    makes several of one.
+    Of several neighbours that all attract, or all do not, with one top up to rounding, the first is
+    kept: between two fixed points of that sort is another one. Where a saddle's orbit returns to
+    it, rounding of the map, which rises there like a square root, makes several of one.
     """
     kept = list(cycles[:1])
     for before, cycle in pairwise(cycles):
@@ -405,10 +415,10 @@ def _with_tops_apart(cycles: Sequence[Cycle]) -> list[Cycle]:
 
 
 def _changes_of_sign(rise: np.ndarray) -> list[tuple[int, int, bool]]:
-    """Between which of its values at even steps a function changes its sign, and whether these are
+    """Changes of sign of a function between its values at even steps, and whether they are
     rounding.
 
-    Changes next to one another of which all values are rounding are told as one.
+    Neighbouring changes whose values are all rounding count as one.
     """
     signs = np.flatnonzero(np.sign(rise[:-1]) * np.sign(rise[1:]) <= 0)
     small = np.abs(rise) <= CERTAIN * _error_of(rise)
@@ -423,11 +433,11 @@ def _changes_of_sign(rise: np.ndarray) -> list[tuple[int, int, bool]]:
 
 
 def _error_of(values: np.ndarray) -> float:
-    """The standard deviation of errors in the values of a function at even steps, zero of fewer
-    values than tell it; JUMP at most: what is larger is no error.
+    """Standard deviation of errors in the values of a function at even steps.
 
-    Little is left of a smooth function in its fourth differences; the median of their sizes is 5.6
-    times that of independent errors. A jump is in four of them.
+    Zero for too few values; JUMP at most: larger values are no error. Little is left of a smooth
+    function in its fourth differences; the median of their sizes is 5.6 times that of independent
+    errors. A jump is in four of them.
     """
     left = np.abs(np.diff(values[np.isfinite(values)], 4))
     return min(float(np.median(left)) / 5.6, JUMP) if left.size > 2 * 4 else 0.0
@@ -444,13 +454,12 @@ def _runs_of(flags: np.ndarray) -> np.ndarray:
 
 
 def reach_of(osc: Oscillator) -> float:
-    """How far out a top can be that returns to itself; FARTHEST where that is farther, or not
-    known.
+    """Largest possible top that returns to itself; FARTHEST where that is farther, or not known.
 
-    Let friction be at most F. Half a loop of the linear oscillator with a constant force F takes
-    an extremum x to -(q x + F (1 + q)) at most, q = exp(-pi zeta/(2 w)), w^2 = 1 - zeta^2/4, and no
-    force between -F and F takes it farther; q = 0 from zeta = 2 on. So with q < 1 no top beyond
-    F (1 + q)/(1 - q) comes back as far out. With q > 1, F (1 + q)/(q - 1) is where the least that
+    Let friction be at most F. Half a loop of the linear oscillator with a constant force F takes an
+    extremum x to -(q x + F (1 + q)) at most, q = exp(-pi zeta/(2 w)), w^2 = 1 - zeta^2/4, and no
+    force between -F and F takes it farther; q = 0 from zeta = 2 on. So with q < 1 no top beyond F
+    (1 + q)/(1 - q) comes back as far out. With q > 1, F (1 + q)/(q - 1) is where the least that
     half a loop leads to, q x - F (1 + q), is x, and from farther out orbits go to infinity.
     Friction that opposes the motion and grows with the speed brings orbits further in; with q > 1
     it holds cycles farther out, see `_reach_of_friction_that_grows`.
@@ -461,7 +470,7 @@ def reach_of(osc: Oscillator) -> float:
     friction = sum(_largest_pull(belt) for belt in osc.belts)
     friction += abs(float(sum(constant_force(osc))))
     bound = friction * (1 + decay) / max(1 - decay, 1e-12)
-    # Equilibria and all that may be an end of an interval lie within.
+    # Equilibria and all possible ends of an interval lie within.
     inner = [friction, *(abs(edge) for edge in map(float, edges(osc)) if np.isfinite(edge))]
     inner += [abs(float(belt.velocity / osc.omega)) for belt in osc.belts]
     reach = float(max(min(1.01 * bound + 1.0, FARTHEST), max(inner) + 1.0))

@@ -1,29 +1,31 @@
 """Orbits that bound basins, from the points in which they end: `Separatrix`.
 
-On an edge x1 = sigma the velocity is x1' = x2 on both sides, so at (sigma, 0) orbits turn: those of
+On an edge x1 = sigma the velocity is x1' = x2 on both sides, so orbits turn at (sigma, 0): those of
 a side that pulls away from the edge touch it there. Where neither side draws the mass in, orbits
-that pass the edge just below that point, or above it, go on, and those that miss it turn. They part
-at the orbit that ends in the point, one from each side: the stable separatrices, reached in finite
-time. Where a side pushes away an orbit leaves from the point, an unstable separatrix. Where both do
-the point is a saddle; where a belt at rest holds the mass on one side, a segment ends in it.
+that pass the edge just below that point, or above it, go on, and those that miss it turn. The orbit
+that ends in the point, one from each side, separates them: the stable separatrices, reached in
+finite time. Where a side pushes away an orbit leaves from the point, an unstable separatrix. Where
+both do the point is a saddle; where a belt at rest holds the mass on one side, a segment ends in
+it.
 
 Where a segment ends elsewhere, at the limit of what belts at rest hold, orbits that stop within it
-stay, and those that stop beyond turn back. These are caught, too, if only they stop near enough,
-unless friction falls so steeply that the end is an unstable node of the field in which they turn,
-or the static limit exceeds mu(0). Then the orbit that arrives in the end bounds the basin.
+stay, and those that stop beyond turn back. These are caught, too, if they stop near enough, unless
+friction falls so steeply that the end is an unstable node of the field in which they turn, or the
+static limit exceeds mu(0). Then the orbit that arrives in the end bounds the basin.
 
-Where the static limit of a belt exceeds mu(0) an orbit that touches its boundary parts those that
-pass by from those that stick, for these do so until the static limit. It ends in the point where
-it touches, and goes on as both.
+Where the static limit of a belt exceeds mu(0) an orbit that touches its boundary separates those
+that pass by from those that stick, as these stick until the static limit. It ends in the point
+where it touches, and continues as both.
 
 Stable separatrices are followed backwards: in reversed time, t -> -t and x2 -> -x2, an oscillator
-with the signs of its damping, loads and velocities changed. Backwards, too, an orbit goes on in one
-way as long as it slips, for it comes to a boundary only where orbits cross it: the mass leaves a
-stick phase in one place only, slip onset. With a law whose static limit exceeds mu(0), orbits leave
-upwards or downwards all along a piece of the boundary beyond slip; then the separatrix ends there,
-and that piece of the boundary itself parts the motions.
+with the signs of its damping, loads and velocities changed. Backwards, too, an orbit continues in
+one way as long as it slips, for it comes to a boundary only where orbits cross it: the mass leaves
+a stick phase in one place only, slip onset. With a law whose static limit exceeds mu(0), orbits
+leave upwards or downwards all along a piece of the boundary beyond slip; then the separatrix ends
+there, and that piece of the boundary itself divides the motions.
 """
 
+from collections.abc import Callable
 from itertools import product
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -31,10 +33,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array
 
 from ..checks import number
-from ..model.equilibria import Equilibria, EquilibriumKind, at_rest_beside
+from ..model.equilibria import Equilibria, EquilibriumKind, at_rest_beside, equilibria
 from ..model.modes import (
     STUCK,
     Mode,
@@ -45,19 +48,20 @@ from ..model.modes import (
     mode_acceleration,
     mode_of,
     select,
+    zone_ends,
 )
 from ..model.oscillator import Oscillator
 from ..model.own_units import quantity
 from ..model.transitions import contact, contact_beside, mode_of_state
 from ..motion.arcs import Ends
+from ..motion.integrators import STRIDE, density
 from ..numerics.compiling import each, jit
 from ..results import Status, draw
 from ..tables import table_of
 from .backwards import reversed_in_time
 from .chains import Loop
-from .creeping import arc_samples
 from .orbits import Orbit, follow_finely, place_of_rest
-from .shooting import trace_of
+from .shooting import flow, trace_of
 
 if TYPE_CHECKING:
     import pandas
@@ -65,30 +69,35 @@ if TYPE_CHECKING:
 #: Arcs for which a separatrix is followed, some 40 loops; and a stable one that still grows then,
 #: as where damping is weak and loops pass many edges.
 SEPARATRIX_ARCS, MORE_ARCS = 256, 2048
-#: Tops that move on by less, relative to the distance from the origin, are settling.
+#: Tops that move by less, relative to the distance from the origin, are converging.
 SETTLING = 1e-6
-#: Samples of each arc.
-ARC_SAMPLES = 32
+#: Samples of each arc; steps of integration, of order 12, between them at most.
+ARC_SAMPLES, STEPS_ALONG = 32, 100_000
 
 
 class Separatrix(eqx.Module):
-    """An orbit that leaves, or ends in, a point: (sigma, 0) of a contact edge, an end of a segment,
-    where it touches the boundary of a belt whose static limit exceeds mu(0), or where an edge cuts
-    off the piece of such a boundary on which only that limit holds the mass.
+    """An orbit that leaves, or ends in, a point that divides motions.
 
-    - point: (x1, x2). side: "left" or "right", on which side of it the orbit is there. stable:
-      whether it ends in the point, and so may bound basins, or leaves it.
-    - ts: times, 0 at the point, [samples]; ys: states (x1, x2), [samples, 2]; both in the order of
-      time, and good to 1e-9. Ends of arcs are among the samples.
-    - end: what its other end is, where an unstable one leads to and a stable one comes from:
-      "equilibrium" (or an end of a segment), "cycle", "outside" (of `|x1|`, `|x2|` < reach, see
-      `Portrait`), "boundary" (of a belt whose static limit exceeds mu(0): it leaves this boundary
-      beside a piece where the mass sticks), or "unsettled" (it approaches what it comes from, or
-      leads to, too slowly).
-    - to: the number of that equilibrium, or of that attracting or unstable cycle, in the portrait;
-      else -1.
-    - arcs: as it was followed from its point, arc by arc; where it is stable backwards, in the
-      oscillator reversed in time. What ends the last one, if it was left there, is "unused".
+    The point is (sigma, 0) of a contact edge, an end of a segment, a point where the orbit touches
+    the boundary of a belt whose static limit exceeds mu(0), or one where an edge cuts off the piece
+    of such a boundary on which only that limit holds the mass.
+
+    Attributes:
+        point: The point (x1, x2).
+        side: "left" or "right": the side of the point on which the orbit is there.
+        stable: Whether it ends in the point, and so may bound basins, or leaves it.
+        ts: Times, 0 at the point, in order, [samples].
+        ys: States (x1, x2), [samples, 2], good to 1e-9. Ends of arcs are among the samples.
+        end: The other end, where an unstable one leads to and a stable one comes from:
+            "equilibrium" (or an end of a segment), "cycle", "outside" (of `|x1|`, `|x2|` < reach,
+            see `Portrait`), "boundary" (of a belt whose static limit exceeds mu(0): it leaves this
+            boundary beside a piece where the mass sticks), or "unsettled" (it approaches its end
+            too slowly).
+        to: Number of that equilibrium, or of that attracting or unstable cycle, in the portrait;
+            else -1.
+        arcs: The arcs as it was followed from its point; for a stable one backwards, in the
+            oscillator reversed in time. The end of the last arc, if it is not an event, is
+            "unused".
     """
 
     point: Array = eqx.field(metadata=quantity("length", "velocity"))
@@ -101,13 +110,19 @@ class Separatrix(eqx.Module):
     arcs: Loop
 
     def table(self) -> "pandas.DataFrame":
-        """A row for each sample, in the order of time: t, x1, x2."""
+        """Returns a row for each sample, in the order of time; columns: t, x1, x2."""
         x1, x2 = np.asarray(self.ys).T
         return table_of({"t": self.ts, "x1": x1, "x2": x2})
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw it in the phase plane, with its point, into the axes `ax` (None: new ones), which
-        are returned."""
+        """Draws the separatrix in the phase plane, with its point.
+
+        Args:
+            ax: Axes; None makes new ones.
+
+        Returns:
+            The axes.
+        """
         return draw(self, ax)
 
     def __repr__(self) -> str:
@@ -122,9 +137,9 @@ class Separatrix(eqx.Module):
 class TracedSeparatrix(NamedTuple):
     """A separatrix as it was followed: backwards, with x2 reversed, where it is stable.
 
-    tops: its maxima of x1 in the order in which it came to them; y: where it was left; rest: x1
-    where it came to rest, else NaN; status: of the orbit; cut: whether it came to a piece of a
-    boundary where the mass sticks; arcs: see `Separatrix`.
+    tops: its maxima of x1 in the order in which it reached them; y: its last state; rest: x1 where
+    it came to rest, else NaN; status: of the orbit; cut: whether it came to a piece of a boundary
+    where the mass sticks; arcs: see `Separatrix`.
     """
 
     point: tuple[float, float]
@@ -141,8 +156,10 @@ class TracedSeparatrix(NamedTuple):
 
 
 def branches(osc: Oscillator, rests: Equilibria, reach: float) -> list[TracedSeparatrix]:
-    """All separatrices of an oscillator, followed as long as |x1| and |x2| are < reach; rests:
-    where the mass can rest."""
+    """All separatrices of an oscillator, followed as long as |x1| and |x2| are < reach.
+
+    rests: states of rest.
+    """
     positions = np.asarray(jnp.stack(edges(osc)))
     found: list[TracedSeparatrix | None] = []
     parting: list[float] = []
@@ -176,8 +193,10 @@ def _as_arrays(*numbers: float | int | bool) -> list[Array]:
 
 @jit
 def _orbits_part(osc: Oscillator, x1: Array) -> Array:
-    """Whether orbits part at an edge, x1 [1]: one side pushes away, the other one, too, or a belt
-    holds the mass there. A fixed point that lies on the edge, but for rounding, does not part them.
+    """Whether an edge, x1 [1], divides orbits: one side pushes away, the other one, too, or a belt
+    holds.
+
+    A fixed point that lies on the edge, up to rounding, does not divide them.
     """
     (left, a_left), (right, a_right) = (
         at_rest_beside(osc, x1, rightward=side) for side in (False, True)
@@ -216,15 +235,14 @@ def _leaves(osc: Oscillator, x1: Array, rightward: Array) -> tuple[Array, Array]
 
 @jit
 def tangencies(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
-    """Where orbits touch the boundary of a belt whose static limit exceeds mu(0), one point for
-    each zone between contact edges, [zones, 2], NaN where there is none; and the modes of these
-    orbits, [zones, belts].
+    """Points where orbits touch the boundary of a belt whose static limit exceeds mu(0).
 
-    x2'' = -x2 there, so they are orbits that slip with the sign of the belt's velocity.
+    One point for each zone between contact edges, [zones, 2], NaN where there is none; and the
+    modes of these orbits, [zones, belts]. x2'' = -x2 there, so they are orbits that slip with the
+    sign of the belt's velocity.
     """
     v = jnp.stack([one.velocity for one in osc.belts])[belt] / osc.omega
-    positions, end = jnp.sort(jnp.stack(edges(osc))), jnp.full(1, jnp.inf)
-    lower, upper = jnp.concatenate([-end, positions]), jnp.concatenate([positions, end])
+    lower, upper = zone_ends(osc)
     stuck = contact(osc, lower, v, rightward=True)
     slips = Mode(tuple(jnp.where(code == STUCK, jnp.sign(v), code) for code in stuck.codes))
     zero = jnp.zeros_like(lower)
@@ -238,16 +256,16 @@ def tangencies(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
 
 @jit
 def corners(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
-    """Where a contact edge cuts off a piece of a belt's boundary on which only a static limit that
-    exceeds mu(0) holds the mass, where the mass comes in: one point for each zone between edges,
-    [zones, 2], NaN where there is none; and the modes of the orbits that come to them, [zones,
-    belts].
+    """Points where a contact edge cuts off a piece of a belt's boundary that only static friction
+    holds.
 
-    On one side of such an orbit the mass comes to be held, on the other it slips away.
+    On that piece only a static limit that exceeds mu(0) holds the mass. One point where the mass
+    comes in for each zone between edges, [zones, 2], NaN where there is none; and the modes of the
+    orbits that come to them, [zones, belts]. On one side of such an orbit the mass is held, on the
+    other it slips away.
     """
     v = jnp.stack([one.velocity for one in osc.belts])[belt] / osc.omega
-    positions, end = jnp.sort(jnp.stack(edges(osc))), jnp.full(1, jnp.inf)
-    lower, upper = jnp.concatenate([-end, positions]), jnp.concatenate([positions, end])
+    lower, upper = zone_ends(osc)
     x1 = jnp.where(v > 0, lower, upper)
     inside, before = (_beside(osc, x1, v, rightward=side) for side in (v > 0, v < 0))
     slips = _slipping(inside, jnp.sign(v))
@@ -281,6 +299,25 @@ def _slipping(mode: Mode, sign: Array) -> Mode:
     return Mode(tuple(jnp.where(code == STUCK, sign, code) for code in mode.codes))
 
 
+def end_points(osc: Oscillator) -> Array:
+    """All points in which separatrices may begin or end, [points, 2], NaN where there is none.
+
+    Those of contact edges, those of boundaries, and the ends of what can rest, which come last:
+    their number is not known under a trace.
+    """
+    points = [
+        ends_of(osc, *_as_arrays(belt))[0]
+        for belt in range(len(osc.belts))
+        for ends_of in (tangencies, corners)
+    ]
+    rests = equilibria(osc)
+    ends = jnp.stack([rests.x1_lower, rests.x1_upper], axis=1).reshape(-1)
+    on_edges, at_rest = (
+        jnp.stack([x1, jnp.zeros_like(x1)], axis=1) for x1 in (jnp.stack(edges(osc)), ends)
+    )
+    return jnp.concatenate([on_edges, *points, at_rest])
+
+
 def _at_rest(
     osc: Oscillator, x1: float, side: str, stable: bool, reach: float
 ) -> TracedSeparatrix | None:
@@ -292,10 +329,65 @@ def _at_rest(
     return _branch(osc, (x1, 0.0), mode, side, stable, reach) if leaves else None
 
 
+def places_along(
+    osc: Oscillator, codes: Array, y: Array, duration: Array, rate: Callable, marks: Array
+) -> tuple[Array, Array]:
+    """Times since the entry of an arc, and states, [n] and [n, 2], at which an integral reaches
+    marks.
+
+    rate: the integrand, a function of the state; marks: in order. Marks that are not reached are at
+    the end of the arc.
+    """
+    mode = mode_of(codes)
+
+    def to(carry, mark):
+        def before(carry):
+            _, left, total = carry
+            # Where there is no rate, NaN, the arc ends.
+            return (left > 0) & ~(total >= mark)
+
+        def step(carry):
+            y, left, total = carry
+            wanted = jnp.maximum(STRIDE / density(osc, mode, *y), duration / STEPS_ALONG)
+            length, pace = jnp.minimum(wanted, left), rate(y)
+            passes = total + pace * length > mark
+            length = jnp.where(passes, (mark - total) / pace, length)
+            total = jnp.where(passes, mark, total + pace * length)
+            return flow(osc, codes, jnp.ones(1), y, length), left - length, total
+
+        carry = lax.while_loop(before, step, carry)
+        y, left, _ = carry
+        return carry, (duration - left, y)
+
+    return lax.scan(to, (y, duration, jnp.zeros(())), marks)[1]
+
+
+def arc_samples(
+    osc: Oscillator, codes: Array, y: Array, exit_: Array, duration: Array, n: int
+) -> tuple[Array, Array]:
+    """Times and states of n samples of an arc, the last at its end.
+
+    Three quarters of them are spread evenly along its way in the plane, the others evenly in time.
+    x1 and x2 are monotone, as extrema end arcs: |dx1| + |dx2| of the arc is the integral of that of
+    its steps.
+    """
+    mode = mode_of(codes)
+    way = jnp.sum(jnp.abs(exit_ - y))
+
+    def rate(y):
+        pull = jnp.where(mode.any_stuck, 0.0, mode_acceleration(osc, mode, *y))
+        return 0.75 * (jnp.abs(y[1]) + jnp.abs(pull)) / way + 0.25 / duration
+
+    marks = jnp.append(jnp.arange(1, n) / n, jnp.inf)
+    return places_along(osc, codes, y, duration, rate, marks)
+
+
 @jit
 def _orbit_from(osc: Oscillator, y: Array, codes: Array, reach: Array, budget: int):
-    """The orbit from a state in a mode, where it comes to rest, and of each of its arcs times since
-    its entry, [arcs, samples], and states there."""
+    """The orbit from a state in a mode, its place of rest, and samples of its arcs.
+
+    Samples are times since the entry, [arcs, samples], and states there.
+    """
     orbit = follow_finely(osc, mode_of(codes), y, budget, reach)
     rest = place_of_rest(osc, orbit)
     used = jnp.arange(budget) < orbit.count
@@ -360,7 +452,7 @@ def _branch(
     # The last arc was left, unless it came to where the mass sticks.
     known = np.arange(count) < count - (not was_cut)
     ends = np.where(known, orbit.ends[:count], Ends(len(osc.belts)).unused)
-    # An arc that creeps is one, though followed in pieces.
+    # An arc that creeps is one, though it was followed in pieces.
     whole = min(count, int(np.argmax(np.append(ends, -1) < 0)) + 1)
     durations = np.append(since[: whole - 1, -1], np.sum(since[whole - 1 : count, -1]))
     ends = np.where(ends < 0, Ends(len(osc.belts)).unused, ends)

@@ -1,11 +1,12 @@
-"""How much it takes to lose an attractor: `minimal_fatal_shock` and what it returns, `FatalShock`.
+"""The smallest shock that leads off an attractor: `minimal_fatal_shock` and its result,
+`FatalShock`.
 
 A shock moves the state (x1, x2) of a mass that is on an attractor. It is fatal if the mass then
 goes elsewhere. The smallest fatal shock is the distance of the attractor from the boundary of its
 basin (L. Halekotte and U. Feudel, Minimal fatal shocks in multistable complex networks, Scientific
 Reports 10 (2020) 11783), which here is known exactly: it consists of unstable cycles and of stable
 separatrices. So the shock is known to the same digits, and its derivatives are known, too: where
-the way is shortest a change of its ends along the curves counts nothing, only the change of the
+the way is shortest a change of its ends along the curves does not matter, only the change of the
 curves does.
 """
 
@@ -20,41 +21,44 @@ from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
 from ..checks import as_array, as_whole, check_finite, is_concrete, number, require, require_one_of
-from ..model.oscillator import Oscillator, check_oscillator
+from ..model.oscillator import Oscillator, check_oscillator, refuse_clock
 from ..model.own_units import OwnOscillator, in_given_units, in_units_of_run, quantity, rescaled
 from ..results import Status, describe, draw
 from ..tables import table_of
-from .nearest import ShortestWay, end_of_way, sampled_curve, sampled_point, shortest_between
-from .outlines import Outline, outline_of_cycle
+from .nearest import ShortestWay, in_parts, shortest_between
+from .outlines import ClosedOutline, Outline, StraightOutline, straight
 from .portrait import TRACED, Portrait, portrait
-from .sides import Bound, Destination, bounds_of, destination_of_name, leads_to, resting_places
+from .sides import Bound, Destination, bounds_of, leads_to, segments_of
 
 if TYPE_CHECKING:
     import pandas
 
-#: What a shock may change.
+#: Possible directions of a shock.
 DIRECTIONS = ("both", "x2")
-#: Of what has one of these no number is known.
+#: Statuses with which no number is known.
 FAILED = (Status.NOT_SETTLED, Status.NO_CONVERGENCE)
 
 
 class FatalShock(eqx.Module):
-    """What `minimal_fatal_shock` returns.
-
-    - portrait: of the oscillator, see `Portrait`.
-    - direction: "both" or "x2", what the shock changes.
-    - attractor: which one is left: "cycle 0" or "equilibrium 2", numbers in the portrait.
-    - boundary: what the shock leads to, "unstable cycle 0", "separatrix 3" (numbers in the
-      portrait), "boundary of belt 0" (one whose static limit exceeds mu(0)), or "none".
-    - beyond: where starts lead on the other side of it: "cycle 1", "equilibrium 0", "infinity".
-    - distance: the size of the shock; inf where there is no boundary in that direction.
-    - start: the state (x1, x2) on the attractor from where it is the smallest, [2]; shock: the
-      change of it, [2]; NaN where there is no boundary.
-    - status: OK; INCOMPLETE, where the portrait does not tell all boundaries, or they were followed
-      no farther than this; NOT_SETTLED, where y0 leads to no attractor, and NO_CONVERGENCE, where
-      Newton's method failed: then every number is NaN.
+    """The smallest fatal shock of an attractor; what `minimal_fatal_shock` returns.
 
     distance, start and shock are differentiable by every parameter of the oscillator.
+
+    Attributes:
+        portrait: Portrait of the oscillator, see `Portrait`.
+        direction: "both" or "x2", what the shock changes.
+        attractor: The attractor that is left: "cycle 0" or "equilibrium 2", numbers in the
+            portrait.
+        boundary: Where the shock leads: "unstable cycle 0", "separatrix 3" (numbers in the
+            portrait), "boundary of belt 0" (one whose static limit exceeds mu(0)), or "none".
+        beyond: Where starts lead on the other side of it: "cycle 1", "equilibrium 0", "infinity".
+        distance: Size of the shock; inf where there is no boundary in that direction.
+        start: State (x1, x2) on the attractor from which the shock is the smallest, [2]; NaN where
+            there is no boundary.
+        shock: Change of this state, [2], likewise.
+        status: OK; INCOMPLETE, where the portrait may lack boundaries, or they were not followed as
+            far as this; NOT_SETTLED, where y0 leads to no attractor, and NO_CONVERGENCE, where
+            Newton's method failed: then every number is NaN.
     """
 
     portrait: Portrait
@@ -68,30 +72,40 @@ class FatalShock(eqx.Module):
     status: Array
 
     def at_phases(self, n: int) -> "pandas.DataFrame":
-        """The smallest fatal shock at each of n phases of the cycle, evenly spread over a period
-        (of an equilibrium at its one state): t, the time since the first of them, x1, x2, distance,
-        shock_x1, shock_x2; inf and NaN where there is no boundary in that direction."""
+        """The smallest fatal shock at each of n phases of the cycle, evenly spread over a period.
+
+        Args:
+            n: Number of phases; an equilibrium has one.
+
+        Returns:
+            A row for each phase, with the columns t, the time since the first phase, x1, x2,
+            distance, shock_x1, shock_x2; inf and NaN where there is no boundary in that direction.
+        """
         known, along_x2 = in_units_of_run(self.portrait.oscillator), self.direction == "x2"
-        told, unit = _in_units_of(self.portrait, known), float(known.units.length)
-        end = destination_of_name(self.attractor)
-        ts, states = _phases(told, end, as_whole(n, "n"))
-        beside = [bound for bound in bounds_of(told) if end in bound.sides]
-        curves = [sampled_curve(known, bound.outline) for bound in beside]
+        shown, unit = _in_units_of(self.portrait, known), float(known.units.length)
+        end = Destination.of_name(self.attractor)
+        ts, states = _phases(shown, end, as_whole(n, "n"))
+        outlines = [bound.outline for bound in bounds_of(shown) if end in bound.sides]
+        curves = [in_parts(known, outline.pieces(known)) for outline in outlines]
         rows = []
-        for t, y in zip(ts, states, strict=True):
-            point, best, shock = sampled_point(known, y), np.inf, np.full(2, np.nan)
-            for curve in curves:
-                length, meeting = shortest_between(known, point, curve, along_x2=along_x2)
-                if meeting is not None and not length >= best:
-                    best, shock = length, end_of_way(known, curve, meeting) - y
-            rows.append((t, *(unit * np.array([*y, best, *shock])).tolist()))
-        columns = zip(*rows, strict=True)
+        for t, y in zip(ts.tolist(), states, strict=True):
+            x1, x2 = map(jnp.asarray, y)
+            point = in_parts(known, straight(known, x1, x1, x2))
+            ways = [shortest_between(known, point, curve, along_x2=along_x2) for curve in curves]
+            best, to = np.inf, np.full(2, np.nan)
+            for length, its_end, meeting in ways:
+                if meeting is not None and length < best:
+                    best, to = length, its_end
+            rows.append([t, *(unit * np.array([*y, best, *(to - y)])).tolist()])
         names = ("t", "x1", "x2", "distance", "shock_x1", "shock_x2")
-        return table_of({name: list(column) for name, column in zip(names, columns, strict=True)})
+        return table_of([dict(zip(names, row, strict=True)) for row in rows])
 
     def table(self) -> "pandas.DataFrame":
-        """One row: attractor, direction, distance, x1 and x2 of the start, shock_x1, shock_x2,
-        boundary, beyond, status."""
+        """Returns one row.
+
+        Columns: attractor, direction, distance, x1 and x2 of the start, shock_x1, shock_x2,
+        boundary, beyond, status.
+        """
         (x1, x2), (shock_x1, shock_x2) = map(np.asarray, (self.start, self.shock))
         row = {
             "attractor": self.attractor,
@@ -105,8 +119,14 @@ class FatalShock(eqx.Module):
         return table_of([row])
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw it as an arrow in the portrait, into the axes `ax` (None: new ones), which are
-        returned."""
+        """Draws the shock as an arrow in the portrait.
+
+        Args:
+            ax: Axes; None makes new ones.
+
+        Returns:
+            The axes.
+        """
         return draw(self, ax)
 
     def __repr__(self) -> str:
@@ -127,24 +147,31 @@ def minimal_fatal_shock(
 ) -> FatalShock:
     """The smallest change of the state after which a mass on an attractor goes elsewhere.
 
-    osc: `Oscillator`, or its `portrait`, where that is known; y0: a start (x1, x2) that leads to
-    the attractor, a cycle, an equilibrium or a segment, shape [2]. direction: "both", a change of
-    x1 and x2, of size sqrt(dx1^2 + dx2^2), or "x2", of the velocity alone, as a blow makes it.
-    Dimensionless; see `FatalShock` for what comes back.
-
     It is the least over all states of the attractor, that is, over all phases of a cycle, to 1e-9.
-    Of unstable cycles and separatrices those count that have the attractor on one side and
-    something else on the other. An unstable equilibrium is no boundary: starts around it do not
-    stay.
+    Unstable cycles and separatrices count if they have the attractor on one side and something else
+    on the other. An unstable equilibrium is no boundary: starts around it do not stay.
 
     Differentiable by every parameter with `jax.grad`, `jax.jacfwd` and `jax.jacrev`: the derivative
-    is that of the piece of the boundary that is the nearest. As for `portrait`, how much there is
-    decides what is computed, so not in `jax.jit` and `jax.vmap`. `ValueError` names an argument
-    that is impossible.
+    is that of the nearest piece of the boundary. As for `portrait`, the numbers decide how much is
+    computed, so not for `jax.jit` and `jax.vmap`.
+
+    Args:
+        osc: The oscillator, or its `portrait`, where that is known.
+        y0: Start (x1, x2) that leads to the attractor, a cycle, an equilibrium or a segment, shape
+            [2].
+        direction: "both", a change of x1 and x2, of size sqrt(dx1^2 + dx2^2), or "x2", of the
+            velocity alone, as a blow makes it. Dimensionless.
+
+    Returns:
+        The `FatalShock`.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
     shown = osc if isinstance(osc, Portrait) else None
     osc = osc.oscillator if isinstance(osc, Portrait) else osc
     check_oscillator(osc)
+    refuse_clock(osc, "minimal_fatal_shock", "jb.simulate from several starts")
     y0 = as_array(y0, "y0", (2,))
     check_finite(y0, "y0")
     require_one_of(direction, DIRECTIONS, "direction")
@@ -154,9 +181,9 @@ def minimal_fatal_shock(
     concrete = is_concrete((known, start))
     require(concrete, "osc", "known: shocks are not for jit or vmap", "a traced one")
     shown = portrait(lax.stop_gradient(given)) if shown is None else shown
-    told = _in_units_of(shown, known)
-    (end,) = leads_to(told, np.asarray(start)[None])
-    way, bound, status = shortest_way_out(told, end, along_x2=direction == "x2")
+    own_portrait = _in_units_of(shown, known)
+    (end,) = leads_to(own_portrait, np.asarray(start)[None])
+    way, bound, status = shortest_way_out(own_portrait, end, along_x2=direction == "x2")
     if bound is None or way is None:
         distance = jnp.asarray(np.array(np.nan if status in FAILED else np.inf))
         nowhere = jnp.asarray(np.full(2, np.nan))
@@ -179,9 +206,9 @@ def minimal_fatal_shock(
     return replace(in_given_units(found, given, osc), portrait=shown)
 
 
-def _in_units_of(told: Portrait, own: OwnOscillator) -> Portrait:
-    """A portrait, whose oscillator this is in own units, in these."""
-    return rescaled(told, 1 / own.units.length, lambda _: own)
+def _in_units_of(own_portrait: Portrait, own: OwnOscillator) -> Portrait:
+    """A portrait in own units; own: its oscillator in these."""
+    return rescaled(own_portrait, 1 / own.units.length, lambda _: own)
 
 
 def length_of(shock: Array, direction: str) -> Array:
@@ -190,56 +217,60 @@ def length_of(shock: Array, direction: str) -> Array:
 
 
 def shortest_way_out(
-    told: Portrait, end: Destination, *, along_x2: bool
+    own_portrait: Portrait, end: Destination, *, along_x2: bool
 ) -> tuple[ShortestWay | None, Bound | None, Status]:
-    """The shortest way from an attractor to the boundary of its basin, and which that is; None if
-    there is none in that direction, or the status is one of FAILED."""
+    """The shortest way from an attractor to the boundary of its basin, and that boundary.
+
+    None if there is none in that direction, or the status is one of FAILED.
+    """
     if end.what not in ("cycle", "equilibrium"):
         return None, None, Status.NOT_SETTLED
-    osc, outline = told.oscillator, _outline_of(told, end)
-    first, found = sampled_curve(osc, outline), bounds_of(told)
+    osc, outline = own_portrait.oscillator, _outline_of(own_portrait, end)
+    first, found = in_parts(osc, outline.pieces(osc)), bounds_of(own_portrait)
     shortest, way, beside = np.inf, None, None
     for bound in (bound for bound in found if end in bound.sides):
-        second = sampled_curve(osc, bound.outline)
-        length, meeting = shortest_between(osc, first, second, along_x2=along_x2)
+        second = in_parts(osc, bound.outline.pieces(osc))
+        length, _, meeting = shortest_between(osc, first, second, along_x2=along_x2)
         if np.isnan(length):
             return None, None, Status.NO_CONVERGENCE
         if meeting is not None and length < shortest:
             shortest, beside = length, bound
             way = ShortestWay(outline, bound.outline, meeting, along_x2)
-    farthest = max(np.max(np.abs(ends)) for ends in (first.parts.low, first.parts.high))
+    farthest = max(np.max(np.abs(ends)) for ends in (first.low, first.high))
     # Beyond that separatrices are not followed.
-    goes_on = any(one.stable and one.end == "outside" for one in told.separatrices)
-    complete = not goes_on or shortest + farthest < TRACED * told.reach
-    complete = complete and _tells_all(told, found)
+    goes_on = any(one.stable and one.end == "outside" for one in own_portrait.separatrices)
+    complete = not goes_on or shortest + farthest < TRACED * own_portrait.reach
+    complete = complete and _is_complete(own_portrait, found)
     return way, beside, Status.OK if complete else Status.INCOMPLETE
 
 
-def _tells_all(told: Portrait, found: list[Bound]) -> bool:
+def _is_complete(own_portrait: Portrait, found: list[Bound]) -> bool:
     """Whether nothing is missing among the bounds of a portrait."""
     known = all(side.what != "undecided" for bound in found for side in bound.sides)
-    # One that ends on a boundary parts the pieces of it, and one of a belt at rest is a segment.
+    # One that ends on a boundary divides the pieces of it, and one of a belt at rest is a segment.
     ends = ("unsettled", "boundary")
-    traced = all(one.end not in ends for one in told.separatrices if one.stable)
+    traced = all(one.end not in ends for one in own_portrait.separatrices if one.stable)
     resting = {
         f"boundary of belt {i}"
-        for i, belt in enumerate(told.oscillator.belts)
+        for i, belt in enumerate(own_portrait.oscillator.belts)
         if float(belt.velocity) == 0
     }
     jumps_at_rest = any(bound.name in resting for bound in found)
-    return int(told.status) == Status.OK and known and traced and not jumps_at_rest
+    return int(own_portrait.status) == Status.OK and known and traced and not jumps_at_rest
 
 
-def _outline_of(told: Portrait, end: Destination) -> Outline:
+def _outline_of(own_portrait: Portrait, end: Destination) -> Outline:
     if end.what == "cycle":
-        return outline_of_cycle(told.cycles[end.number])
-    return next(rest for rest in resting_places(told) if rest.first == end.number)
+        return ClosedOutline.of(own_portrait.cycles[end.number])
+    return next(
+        StraightOutline(-1, *rows) for rows in segments_of(own_portrait) if rows[0] == end.number
+    )
 
 
-def _phases(told: Portrait, end: Destination, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Times and states of an attractor: n of a cycle, one where the mass rests."""
+def _phases(own_portrait: Portrait, end: Destination, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Times and states of an attractor: n for a cycle, one where the mass rests."""
     if end.what == "cycle":
-        cycle = told.cycles[end.number]
+        cycle = own_portrait.cycles[end.number]
         ts = np.linspace(0.0, float(cycle.period), n, endpoint=False)
         return ts, np.asarray(cycle.sample(n + 1))[:n]
-    return np.zeros(1), np.array([[float(told.equilibria.x1[end.number]), 0.0]])
+    return np.zeros(1), np.array([[float(own_portrait.equilibria.x1[end.number]), 0.0]])

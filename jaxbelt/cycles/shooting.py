@@ -1,21 +1,21 @@
 """Shooting with a fixed signature: a closed chain of arcs as a square system of equations.
 
-The mode of every arc, and what ends it, is all that has to be known to compute a cycle: the
+To compute a cycle only the mode of every arc has to be known, and the event that ends it: the
 numbers follow without any event detection (fixed-signature multiple shooting). An arc ends at a
 boundary r_k = 0, at a contact edge, at slip onset, or at an extremum, x2' = 0 or x2 = 0. The
-extrema make x1 and x2 monotone on every arc, so all extrema of a cycle are ends of arcs. Counted
-for N arcs:
+extrema make x1 and x2 monotone on every arc, so all extrema of a cycle are ends of arcs. For N arcs
+there are
 
     3N unknowns    entry state (x1, x2) and duration T of every arc
      N equations   the guard of the arc's end vanishes at its end
     2N equations   the end of an arc is the entry of the next, after the last comes the first
 
 The number N is padded to a few fixed sizes and modes are data, so that one compiled program serves
-all signatures. Slip arcs are integrated by a fixed number of steps of a scheme of order
-twelve, spread over the arc so that they are short where the friction law bends; all arcs at
-once, each step smooth in everything. An arc that magnifies is followed backwards, see
-`solve_closed`. Derivatives of a solution come from the implicit function theorem and work in
-forward and reverse mode and under `jax.vmap`.
+all signatures. Slip arcs are integrated by a fixed number of steps of a scheme of order twelve,
+spread over the arc so that they are short where the friction law bends; all arcs at once, each step
+smooth in everything. An arc that magnifies is followed backwards, see `solve_closed`. Derivatives
+of a solution come from the implicit function theorem and work in forward and reverse mode and under
+`jax.vmap`.
 """
 
 import functools
@@ -53,9 +53,12 @@ from .chains import Chain, Loop, following_codes
 
 #: Integration steps per slip arc (an arc is about a quarter of a loop at most).
 ARC_STEPS = 8
+#: Meshes of more steps than this are laid along a march of steps of this stride over the `density`,
+#: so many at most: those of other ones along even steps, of which some may jump a thin layer.
+EVEN_STEPS, MESH_STRIDE, MESH_MARCH = 32, 0.3, 20_000
 #: An arc of a shorter duration may have none: it is the square root of rounding.
 LASTS = 1e-6
-#: An arc magnifies, if its end moves so much faster than its entry.
+#: An arc magnifies if its end moves so much faster than its entry.
 MAGNIFIED = 1e4
 
 
@@ -118,7 +121,10 @@ def _meshes(steps: int) -> Callable:
 
 
 def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) -> Array:
-    """Steps as fractions of the duration, [steps], so that each has about the same share of it."""
+    """Steps as fractions of the duration, [steps], each with about the same share of the
+    density."""
+    if steps > EVEN_STEPS:
+        return _marched_mesh(osc, steps, codes, y, duration)
     n = 24
 
     def march():
@@ -127,7 +133,7 @@ def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) 
 
         return lax.scan(advance, y, None, length=n)[1]
 
-    # Stick phases, and what pads a chain, take no steps.
+    # Stick phases, and the padding of a chain, take no steps.
     rest = lax.cond(any_lane(duration != 0), march, lambda: jnp.ones(n))
     rho = jnp.concatenate([density(osc, mode_of(codes), *y)[None], rest])
     # Clipped: where a guess is poor the mesh is only less good.
@@ -137,6 +143,41 @@ def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) 
         jnp.linspace(0.0, 1.0, steps + 1), share / share[-1], jnp.linspace(0, 1, n + 1)
     )
     return jnp.diff(grid)
+
+
+def _marched_mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) -> Array:
+    """The same, by as many steps along the arc as its density wants."""
+    even = jnp.linspace(0.0, 1.0, steps + 1)
+
+    def march(total):
+        """The share of the whole duration; and the times of even shares of `total`."""
+
+        def unfinished(carry):
+            number, _, _, left, _, _ = carry
+            return (number < MESH_MARCH) & any_lane(left > 0)
+
+        def advance(carry):
+            number, y, rho, left, share, grid = carry
+            # The last step that there is room for goes to the end.
+            wanted = jnp.where(number < MESH_MARCH - 1, MESH_STRIDE / rho, left)
+            h = jnp.minimum(wanted, left)
+            y, after = coarse_step(osc, codes, y, h)
+            after = jnp.maximum(jnp.nan_to_num(after, nan=1.0), 1.0)
+            more, passed = 0.5 * h * (rho + after), duration - left
+            behind = even * total - share
+            inside = (behind >= 0) & (behind <= more)
+            grid = jnp.where(inside, passed + h * behind / jnp.where(more > 0, more, 1.0), grid)
+            return number + 1, y, after, left - h, share + more, grid
+
+        at = jnp.maximum(density(osc, mode_of(codes), *y), 1.0)
+        start = jnp.asarray(0), y, at, duration, jnp.zeros(()), jnp.zeros(steps + 1)
+        *_, share, grid = lax.while_loop(unfinished, advance, start)
+        return share, grid
+
+    # Stick phases, and what pads a chain, take no steps.
+    _, grid = march(march(jnp.ones(()))[0])
+    grid = grid.at[-1].set(duration) / jnp.where(duration == 0, 1.0, duration)
+    return jnp.diff(jnp.where(duration == 0, even, grid))
 
 
 @lanes_in_one_kernel
@@ -169,7 +210,7 @@ def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, 
         return arc_step(field, state, slip_time * fraction, FINE), None
 
     def advance_some(state, fractions):
-        # What pads a mesh is not worth a step.
+        # Padding of a mesh is skipped.
         some = any_lane(jnp.any(fractions > 0))
         return lax.cond(some, lambda: lax.scan(advance, state, fractions)[0], lambda: state), None
 
@@ -237,9 +278,9 @@ def trace_of(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
 def _magnifies(osc: Oscillator, codes: Array, entry: Array, exit_: Array) -> Array:
     """Whether an arc leads away from a place where the orbit hardly moves, and lingers.
 
-    A mass that a slow belt leaves is such: where it ends is lost in the rounding of where it began,
+    Such is a mass that a slow belt leaves: its end is lost in the rounding of its beginning,
     magnified by the ratio of the two velocities in the plane. Backwards this is the ratio over the
-    growth of areas, so it is done where these grow.
+    growth of areas, so the arc is followed backwards where areas grow.
     """
     osc, entry, exit_ = lax.stop_gradient((osc, entry, exit_))
     mode = mode_of(codes)
@@ -258,11 +299,11 @@ def _arc_equations(osc: Oscillator, codes, end, mesh, backwards, unknown: Array)
     """(x1, x2, guard, 0) at the end of one arc, from its unknowns (x1, x2, T).
 
     Backwards: (x1, x2) are the state in which it ends; of the four numbers the first two are its
-    entry. An unused arc ends as it begins, and its guard is its duration. One that is to end
+    entry. An unused arc ends as it begins, and its guard is its duration. An arc that has to end
     tangent to the boundary of a belt ends at the point of it with x2' = 0. Trial arcs that run past
-    there meet the pole of the friction law, so this one is followed backwards, from that point, to
-    where it begins: (x1, x2) are the point's, the last two the misses of x1 and of x2. That is one
-    equation more, a condition on the oscillator.
+    there meet the pole of the friction law, so this arc is followed backwards, from that point to
+    its beginning: (x1, x2) are the point's, the last two numbers the misses of x1 and of x2. That
+    is one more equation, a condition on the oscillator.
     """
     is_unused = end == Ends(len(osc.belts)).unused
 
@@ -340,8 +381,10 @@ def _arc_columns(chain: Chain, *others: Array) -> tuple[Array, ...]:
 
 @eqx.filter_custom_jvp
 def _by_columns(osc: Oscillator, chain: Chain, backwards: Array, z: Array) -> Array:
-    """`_all_arc_equations`, with derivatives by columns, arc by arc: backwards through all steps
-    takes ten times as long."""
+    """`_all_arc_equations`, with derivatives by columns, arc by arc.
+
+    Reverse mode through all steps takes ten times as long.
+    """
     return _all_arc_equations((osc,), _arc_columns(chain, backwards, z))
 
 
@@ -359,9 +402,11 @@ def _(primals, tangents):
 def residual(
     osc: Oscillator, chain: Chain, z: Array, backwards: Array | None = None
 ) -> tuple[Array, Array]:
-    """The 3N equations at the unknowns z, [N, 3]: mismatch of x1, of x2, guard, for every arc; and
-    the miss of the tangent arcs, zero where there is none. backwards: arcs that are followed so,
-    none unless told, [N]."""
+    """The 3N equations at the unknowns z, [N, 3], and the miss of the tangent arcs.
+
+    Mismatch of x1, of x2, guard, for every arc; the miss is zero where there is no tangent arc.
+    backwards: arcs that are followed backwards, [N]; default none.
+    """
     backwards = _none(z) if backwards is None else backwards
     out = _by_columns(osc, chain, backwards, z)
     return _mismatch(out, z, backwards), jnp.sum(out[:, 3])
@@ -384,9 +429,12 @@ def residual_and_blocks(
     z: Array,
     backwards: Array | None = None,
 ) -> tuple[Array, Array, Array]:
-    """`residual`, and its derivatives: those of the equations of each arc with respect to its
-    (x1, x2, T), and along the k directions `along` in the space of oscillators, if they are given
-    (an oscillator of arrays [k]), [N, 4, 3 + k]."""
+    """`residual`, and its derivatives, [N, 4, 3 + k].
+
+    The derivatives of the equations of each arc with respect to its (x1, x2, T), and along the k
+    directions `along` in the space of oscillators, if these are given (an oscillator of arrays
+    [k]).
+    """
     backwards = _none(z) if backwards is None else backwards
     out, blocks = _equations_and_blocks((osc, along), _arc_columns(chain, backwards, z))
     return _mismatch(out, z, backwards), jnp.sum(out[:, 3]), blocks
@@ -410,7 +458,7 @@ def jacobian(blocks: Array, backwards: Array | None = None) -> Array:
 class ClosedChain(Equations):
     """The 3N equations of a chain in the unknowns z, [N, 3], for an oscillator.
 
-    backwards: the arcs that are followed so, [N].
+    backwards: the arcs that are followed backwards, [N].
     """
 
     chain: Chain
@@ -432,13 +480,14 @@ class ClosedChain(Equations):
 
 
 def solve_closed(osc: Oscillator, chain: Chain, guess: Array) -> tuple[Array, Array, Array]:
-    """The unknowns of a closed chain near a guess of them, [N, 3], differentiable with respect to
-    the oscillator; the number of Newton steps; and how far off the states may be, by the last steps
-    and by rounding: not at all in a chain that sticks, which begins at slip onset, known from the
-    parameters (durations that wander do not move it).
+    """The unknowns of a closed chain near a guess, [N, 3], differentiable with respect to the
+    oscillator.
 
-    An arc that magnifies is followed backwards from the state in which it ends, which is then its
-    unknown: forwards its rounding would be larger than what equations may leave.
+    Also returns the number of Newton steps, and the possible error of the states, by the last steps
+    and by rounding: none in a chain that sticks, which begins at slip onset, known from the
+    parameters (durations that wander do not move it). An arc that magnifies is followed backwards
+    from the state in which it ends, which is then its unknown: forwards its rounding would be
+    larger than the tolerance of the equations.
     """
     guess = lax.stop_gradient(guess)
     backwards = _magnifying(osc, chain, guess)
@@ -451,7 +500,7 @@ def solve_closed(osc: Oscillator, chain: Chain, guess: Array) -> tuple[Array, Ar
 
 
 def closed(osc: Oscillator, chain: Chain, z: Array) -> Array:
-    """The unknowns z, which `solve_closed` has found, differentiable with respect to the
+    """The unknowns z that `solve_closed` has found, differentiable with respect to the
     oscillator."""
     z = lax.stop_gradient(z)
     backwards = _magnifying(osc, chain, z)
@@ -460,12 +509,12 @@ def closed(osc: Oscillator, chain: Chain, z: Array) -> Array:
 
 
 def _with_ends(backwards: Array, z: Array) -> Array:
-    """The entries, or of arcs that are followed backwards the states in which they end."""
+    """The entries, or for arcs that are followed backwards the states in which they end."""
     return jnp.where(_is_end(backwards), jnp.roll(z, -1, axis=0), z)
 
 
 def _with_entries(osc: Oscillator, chain: Chain, backwards: Array, z: Array) -> Array:
-    """The other way round, by following these arcs."""
+    """The inverse of `_with_ends`, by following these arcs."""
 
     def entered():
         return jnp.where(_is_end(backwards), _by_columns(osc, chain, backwards, z)[:, :3], z)
@@ -479,12 +528,12 @@ def _is_end(backwards: Array) -> Array:
 
 @eqx.filter_custom_jvp
 def closure(osc: Oscillator, chain: Chain, z: Array) -> tuple[Array, Array]:
-    """The largest error in the shooting equations, and the determinant of the monodromy matrix with
-    stick phases left out: exp of the mean divergence, and at each crossing of a boundary the
-    determinant of its saltation matrix, x2' after over before.
+    """The largest error in the shooting equations, and the determinant of the monodromy matrix.
 
-    One multiplier of a planar cycle is 1, so this is the other one. Contact edges have determinant
-    one: their saltation matrix is [[1, 0], [jump of x2' / x2, 1]].
+    The latter with stick phases left out: exp of the mean divergence, and at each crossing of a
+    boundary the determinant of its saltation matrix, x2' after over before. One multiplier of a
+    planar cycle is 1, so this is the other one. Contact edges have determinant one: their saltation
+    matrix is [[1, 0], [jump of x2' / x2, 1]].
     """
     entries = jnp.roll(z[:, :2], -1, axis=0)
     columns = _arc_columns(chain, following_codes(chain), z, entries)
@@ -505,7 +554,7 @@ def _(primals, tangents):
 
 
 def _error_and_factor(osc: Oscillator, codes, end, mesh, following, unknown, entry):
-    """The largest error in the equations of an arc, and what it contributes to the determinant."""
+    """The largest error in the equations of an arc, and its factor of the determinant."""
 
     def followed(unknown, entry):
         return _error_and_factor_of(osc, codes, end, mesh, following, unknown, entry)
@@ -545,10 +594,10 @@ def _error_and_factor_of(osc: Oscillator, codes, end, mesh, following, unknown, 
 def multiplier_and_slopes(
     osc: Oscillator, along: Oscillator, chain: Chain, z: Array
 ) -> tuple[Array, Array, Array]:
-    """The determinant that `closure` gives, and its derivatives: with respect to z, [N, 3], and
-    along the k directions `along`, as for `residual_and_blocks`, [k].
+    """The determinant of `closure`, and its derivatives, [N, 3] and [k].
 
-    Arc by arc: backwards through all of them the program takes three times as long to compile.
+    With respect to z, and along the k directions `along`, as for `residual_and_blocks`. Arc by arc:
+    reverse mode through all of them takes three times as long to compile.
     """
     entries = jnp.roll(z[:, :2], -1, axis=0)
     columns = _arc_columns(chain, following_codes(chain), z, entries)
@@ -571,8 +620,8 @@ def _products_of_others(factors: Array) -> Array:
 def _factors_and_slopes(
     osc: Oscillator, along: Oscillator, codes, end, mesh, following, unknown: Array, entry: Array
 ):
-    """The factor of an arc and its derivatives with respect to its unknowns, the entry of the next
-    one, and along the directions, [5 + k]."""
+    """The factor of an arc and its derivatives, [5 + k]: by its unknowns, the next entry, the
+    directions."""
     more = jax.tree.leaves(along)[0].size
 
     def factor(osc, unknown, entry):
@@ -587,12 +636,12 @@ def _factors_and_slopes(
 
 
 def admissible(osc: Oscillator, chain: Chain, z: Array) -> Array:
-    """Whether the oscillator moves like that, as far as equations hold.
+    """Whether the oscillator moves along a solution.
 
-    Every arc has a duration >= 0 and stays inside its mode: both ends are looked at; between them
+    Every arc has a duration >= 0 and stays inside its mode: both ends are examined; between them
     x1, x2 and the needed force are monotone, and no extremum of x1 is passed unmarked. All belts to
-    which the mass sticks have its velocity. None crosses a boundary, or goes on from one beyond an
-    edge, where the mass would stick.
+    which the mass sticks have its velocity. None crosses a boundary, or leaves one beyond an edge,
+    where the mass would stick.
     """
     belts = range(len(osc.belts))
 
@@ -608,7 +657,7 @@ def admissible(osc: Oscillator, chain: Chain, z: Array) -> Array:
         # An arc along which x2 changes its sign passes an extremum of x1 that is no end of an arc.
         lowest, highest = jnp.minimum(unknown[1], exit_[1]), jnp.maximum(unknown[1], exit_[1])
         fine = fine & ((lowest >= -HOLDS) | (highest <= HOLDS))
-        # At the point of a corner what follows the edge has no duration.
+        # At the point of a corner the arc behind the edge has no duration.
         on_boundary = jnp.abs(velocities - osc.omega * exit_[1]) <= HOLDS
         goes_on = on_boundary & (jnp.abs(after) == 1) & lasts
         hit = [(end == belt) | goes_on[belt] for belt in belts]

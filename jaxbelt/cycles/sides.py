@@ -1,10 +1,10 @@
-"""What lies beside the curves that part motions: to which attractors the starts there lead.
+"""Curves that divide motions, and the attractors on both of their sides.
 
 On the axis x2 = 0 all cycles, separatrices and equilibria mark places, and all starts between two
-neighbouring places lead to one attractor. So one start between them tells, far from what is slow.
+neighbouring places lead to one attractor. So one start between them, far from slow motions, is
+enough.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -17,50 +17,49 @@ from ..model.equilibria import EquilibriumKind
 from ..model.modes import edges
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import each, jit
+from ..numerics.padding import filled_up
 from ..results import Status
 from .orbits import MOST_ARCS, follow, place_of_rest
-from .outlines import (
-    JumpOutline,
-    Outline,
-    Rest,
-    jumps,
-    outline_of_cycle,
-    outline_of_separatrix,
-    place_on,
-)
+from .outlines import ClosedOutline, OpenOutline, Outline, StraightOutline, jumps, place_on
 from .portrait import Portrait
 
-#: Starts that are followed in one batch, and how often, MOST_ARCS arcs each.
+#: Starts that are followed in one batch, and number of rounds, MOST_ARCS arcs each.
 STARTS_AT_ONCE, ROUNDS = 16, 32
-#: x2 of places on the axis; of states that are the ends of arcs, good to 1e-9.
+#: Accuracy of x2 of places on the axis; states at ends of arcs are good to 1e-9.
 ON_AXIS = 1e-8
-#: A cycle that attracts weakly is known from as far off, relative to the distance from the origin.
+#: A cycle that attracts weakly is recognised from so far off, relative to the distance from the
+#: origin.
 KNOWN = 1e-3
-#: How far beside a curve that does not cross the axis starts are, and beside a boundary.
+#: Distance of starts from a curve that does not cross the axis, and from a boundary.
 ASIDE = 1e-6
 
 
 class Destination(NamedTuple):
-    """Where a start leads: what ("cycle", "equilibrium", "infinity" or "undecided"), and the number
-    in the portrait, of pieces of a segment that of the first, or -1."""
+    """Destination of a start.
+
+    what: "cycle", "equilibrium", "infinity" or "undecided"; number: in the portrait (for a segment
+    in pieces that of the first), or -1.
+    """
 
     what: str
-    number: int
+    number: int = -1
 
     @property
     def name(self) -> str:
         return f"{self.what} {self.number}" if self.number >= 0 else self.what
 
+    @classmethod
+    def of_name(cls, name: str) -> "Destination":
+        what, _, row = name.partition(" ")
+        return cls(what, int(row) if row else -1)
 
-def destination_of_name(name: str) -> Destination:
-    """The `Destination` with a name."""
-    what, _, row = name.partition(" ")
-    return Destination(what, int(row) if row else -1)
+
+NOT_KNOWN = Destination("undecided")
 
 
 class Bound(NamedTuple):
-    """A curve that may part motions: what it is called, its outline, and where starts lead on its
-    two sides."""
+    """A curve that may divide motions: its name, its outline, and the destinations on its two
+    sides."""
 
     name: str
     outline: Outline
@@ -72,36 +71,32 @@ class Bound(NamedTuple):
 
 
 def bounds_of(portrait: Portrait) -> list[Bound]:
-    """All curves of a portrait that part motions which end differently, or may do so."""
+    """All curves of a portrait that divide motions with different ends, or may do so."""
     osc, places = portrait.oscillator, _places(portrait)
-    found: list[tuple[str, Outline]] = []
-    starts: list[np.ndarray] = []
+    found: list[tuple[str, Outline, np.ndarray]] = []
     for number, cycle in enumerate(portrait.unstable):
-        found.append((f"unstable cycle {number}", outline_of_cycle(cycle)))
-        starts.append(_around(places, float(cycle.x1_max)))
+        starts = _around(places, float(cycle.x1_max))
+        found.append((f"unstable cycle {number}", ClosedOutline.of(cycle), starts))
     for number, one in enumerate(portrait.separatrices):
         if one.stable:
-            outline = outline_of_separatrix(osc, one)
-            found.append((f"separatrix {number}", outline))
+            outline = OpenOutline.of(osc, one)
             x1, x2 = np.asarray(one.point).tolist()
-            starts.append(_around(places, x1) if x2 == 0 else _across(osc, outline))
-    for belt, zone, upper in jumps(osc):
-        outline = JumpOutline(belt, zone, upper)
-        found.append((f"boundary of belt {belt}", outline))
-        starts.append(_across(osc, outline))
-    if not found:
-        return []
-    ends = leads_to(portrait, np.concatenate(starts))
-    pairs = zip(ends[::2], ends[1::2], strict=True)
-    return [
-        Bound(name, outline, pair)
-        for (name, outline), pair in zip(found, pairs, strict=True)
-        if pair[0] != pair[1] or pair[0].what == "undecided"
+            starts = _around(places, x1) if x2 == 0 else _across(osc, outline)
+            found.append((f"separatrix {number}", outline, starts))
+    for belt in range(len(osc.belts)):
+        for row in np.flatnonzero(np.isfinite(jumps(osc, jnp.asarray(np.array(belt)))[0])):
+            outline = StraightOutline(belt, int(row), int(row))
+            found.append((f"boundary of belt {belt}", outline, _across(osc, outline)))
+    ends = leads_to(portrait, np.array([starts for *_, starts in found]).reshape(-1, 2))
+    bounds = [
+        Bound(name, outline, (ends[2 * i], ends[2 * i + 1]))
+        for i, (name, outline, _) in enumerate(found)
     ]
+    return [one for one in bounds if one.sides[0] != one.sides[1] or one.sides[0] == NOT_KNOWN]
 
 
 def _places(portrait: Portrait) -> np.ndarray:
-    """x1 of all that there is on the axis x2 = 0, from left to right."""
+    """x1 of everything on the axis x2 = 0, from left to right."""
     rests = portrait.equilibria
     found = [np.asarray(rests.x1_lower), np.asarray(rests.x1_upper)]
     found.append(np.asarray(jnp.stack(edges(portrait.oscillator))))
@@ -118,10 +113,11 @@ def _around(places: np.ndarray, x1: float) -> np.ndarray:
     """Starts on the axis on both sides of a place, half the way to the next one, [2, 2]."""
     # Places that differ by rounding are one.
     near = 10 * ON_AXIS * (1 + abs(x1))
-    left, right = places[places < x1 - near], places[places > x1 + near]
-    ends = left.max(initial=-np.inf), right.min(initial=np.inf)
-    ends = [end if np.isfinite(end) else x1 + beyond for end, beyond in zip(ends, (-1.0, 1.0))]
-    return np.array([[0.5 * (x1 + end), 0.0] for end in ends])
+    left = places[places < x1 - near].max(initial=-np.inf)
+    right = places[places > x1 + near].min(initial=np.inf)
+    left = left if np.isfinite(left) else x1 - 1.0
+    right = right if np.isfinite(right) else x1 + 1.0
+    return np.array([[0.5 * (x1 + left), 0.0], [0.5 * (x1 + right), 0.0]])
 
 
 def _across(osc: Oscillator, outline: Outline) -> np.ndarray:
@@ -136,24 +132,25 @@ def _across(osc: Oscillator, outline: Outline) -> np.ndarray:
 
 
 def leads_to(portrait: Portrait, starts: np.ndarray) -> list[Destination]:
-    """Where starts lead, [n, 2], among what the portrait tells."""
-    ends: list[Destination | None] = [None] * len(starts)
+    """Destinations of starts, [n, 2], in a portrait."""
+    ends: dict[int, Destination] = {}
     states = np.array(starts, float)
     for _ in range(ROUNDS):
-        left = np.array([i for i, end in enumerate(ends) if end is None], int)
+        left = np.array([i for i in range(len(starts)) if i not in ends], int)
         for first in range(0, left.size, STARTS_AT_ONCE):
             batch = left[first : first + STARTS_AT_ONCE]
-            filled = batch[np.minimum(np.arange(STARTS_AT_ONCE), batch.size - 1)]
-            told = _followed_on(portrait.oscillator, jax.device_put(states[filled]))
-            for i, status, top, rest, y in zip(batch, *map(np.asarray, told)):
-                ends[i] = _destination(portrait, int(status), float(top), float(rest), y)
+            followed = _followed_on(portrait.oscillator, filled_up(states, batch, STARTS_AT_ONCE))
+            for i, status, top, rest, y in zip(batch.tolist(), *map(np.asarray, followed)):
                 states[i] = y
-    return [Destination("undecided", -1) if end is None else end for end in ends]
+                end = _destination(portrait, int(status), float(top), float(rest), y)
+                if end is not None:
+                    ends[i] = end
+    return [ends.get(i, NOT_KNOWN) for i in range(len(starts))]
 
 
 @jit
 def _followed_on(osc: Oscillator, starts: Array):
-    """Of each start, [n, 2]: the status, the last top, where it rests, and where it is left."""
+    """For each start, [n, 2]: the status, the last top, the place of rest, and the last state."""
 
     def one(start):
         orbit = follow(osc, start, MOST_ARCS)
@@ -167,41 +164,35 @@ def _followed_on(osc: Oscillator, starts: Array):
 def _destination(
     portrait: Portrait, status: int, top: float, rest: float, y: np.ndarray
 ) -> Destination | None:
-    """Where an orbit has come to; None if that is not yet known."""
+    """Where an orbit has come to; None if that is not known yet."""
     if not np.isnan(rest):
-        number = _row_of_rest(portrait, rest)
-        return Destination("equilibrium", number) if number >= 0 else Destination("undecided", -1)
+        return _resting_at(portrait, rest)
     if status == Status.OK:
         away = [abs(float(cycle.x1_max) - top) for cycle in portrait.cycles]
         near = len(away) and min(away) < KNOWN * (1 + abs(top))
-        return Destination("cycle", int(np.argmin(away))) if near else Destination("undecided", -1)
+        return Destination("cycle", int(np.argmin(away))) if near else NOT_KNOWN
     if not np.all(np.abs(y) < 10 * portrait.reach):
-        return Destination("infinity" if portrait.escapes else "undecided", -1)
-    return None if status == Status.NOT_SETTLED else Destination("undecided", -1)
+        return Destination("infinity") if portrait.escapes else NOT_KNOWN
+    return None if status == Status.NOT_SETTLED else NOT_KNOWN
 
 
-def _row_of_rest(portrait: Portrait, x1: float) -> int:
-    """The first row of where the mass rests at x1, or -1."""
-    lower, upper = (
-        np.asarray(ends) for ends in (portrait.equilibria.x1_lower, portrait.equilibria.x1_upper)
-    )
-    away = np.maximum(np.maximum(lower - x1, x1 - upper), 0.0)
-    away[np.asarray(portrait.equilibria.kind) == EquilibriumKind.SADDLE] = np.inf
-    row = int(np.argmin(away)) if away.size else -1
-    if row < 0 or not away[row] < KNOWN * (1 + abs(x1)):
-        return -1
-    return next(rest.first for rest in resting_places(portrait) if rest.first <= row <= rest.last)
+def _resting_at(portrait: Portrait, x1: float) -> Destination:
+    """The point or segment where the mass rests at x1."""
+    rests = portrait.equilibria
+    away = np.maximum(np.asarray(rests.x1_lower) - x1, x1 - np.asarray(rests.x1_upper))
+    away = np.maximum(away, 0.0)
+    away[np.asarray(rests.kind) == EquilibriumKind.SADDLE] = np.inf
+    if not np.min(away, initial=np.inf) < KNOWN * (1 + abs(x1)):
+        return NOT_KNOWN
+    row = int(np.argmin(away))
+    return Destination("equilibrium", max(i for i, _ in segments_of(portrait) if i <= row))
 
 
-def resting_places(portrait: Portrait) -> Sequence[Rest]:
-    """Where the mass can rest: points, and segments with all their pieces."""
+def segments_of(portrait: Portrait) -> list[tuple[int, int]]:
+    """Rows of the first and the last piece of each point, or segment, where the mass can rest."""
     rests = portrait.equilibria
     kinds, lower, upper = map(np.asarray, (rests.kind, rests.x1_lower, rests.x1_upper))
-    found: list[Rest] = []
-    for row, kind in enumerate(kinds):
-        goes_on = found and kind == EquilibriumKind.SEGMENT == kinds[row - 1]
-        if goes_on and lower[row] - upper[row - 1] < 1e-12 * (1 + abs(lower[row])):
-            found[-1] = Rest(found[-1].first, row)
-        else:
-            found.append(Rest(row, row))
-    return found
+    held = (kinds[1:] == EquilibriumKind.SEGMENT) & (kinds[:-1] == EquilibriumKind.SEGMENT)
+    goes_on = held & (lower[1:] - upper[:-1] < 1e-12 * (1 + np.abs(lower[1:])))
+    firsts = np.flatnonzero(np.append(True, ~goes_on)[: len(kinds)])
+    return list(zip(firsts.tolist(), [*(firsts[1:] - 1).tolist(), len(kinds) - 1]))

@@ -4,7 +4,7 @@ Starts to the right of the equilibrium at different distances are followed for o
 one that does not come nearer, or that touches a boundary, lies outside of the cycle; between it and
 its neighbour the search is repeated, and Newton's method does the rest. That is one program, for
 `jit`, `vmap` and derivatives. It passes over a cycle with another one that attracts close outside
-of it. So where it finds none, and the oscillator is known, all cycles are looked for, as by
+of it. So where it finds none, and the oscillator is known, all cycles are searched, as by
 `portrait`.
 """
 
@@ -21,7 +21,7 @@ from ..activity import announced
 from ..checks import as_whole, require_value
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates, equilibria, most_equilibria
 from ..model.modes import STUCK
-from ..model.oscillator import Oscillator, check_oscillator
+from ..model.oscillator import Oscillator, check_oscillator, refuse_clock
 from ..model.own_units import in_given_units, in_own_units
 from ..numerics.compiling import each, in_groups, is_outermost, jit
 from ..results import Status
@@ -32,23 +32,33 @@ from .orbits import first_loop, loop_of
 from .portrait import branches_and_returns
 
 #: Loops that are compared in one batch, and how often the interval between two of them is refined:
-#: 31^5 parts of the way from 1e-4 to 10 tell the guess to 4e-7 of itself, so that Newton's method
-#: comes from there to cycles with multipliers of ten thousand.
+#: 31^5 parts of the way from 1e-4 to 10 give the guess to 4e-7 of itself, so that Newton's method
+#: converges from there to cycles with multipliers of ten thousand.
 LOOPS_TRIED, REFINEMENTS = 32, 5
 
 
 @announced("unstable_cycle")
 def unstable_cycle(osc: Oscillator, *, around: int = 0, max_arcs: int | None = None) -> Cycle:
-    """The unstable cycle around a stable equilibrium, that touches no boundary (no sliding).
+    """The unstable cycle around a stable equilibrium that touches no boundary (no sliding).
 
     It separates the starts that come to rest from those that go on to the motion outside of it. It
-    may pass contact edges. osc: `Oscillator`; around: the number of the equilibrium, counted from
-    the left among the stable ones but for segments; max_arcs as for `find_cycle`. Differentiable
-    like any `Cycle`. Where there is none, or none of this sort, the status is NO_UNSTABLE_CYCLE;
-    under `jit`, `vmap` and derivatives also where another cycle attracts close outside of it.
-    `ValueError` names an impossible argument.
+    may pass contact edges. It is differentiable like any `Cycle`.
+
+    Args:
+        osc: The oscillator.
+        around: Number of the equilibrium, counted from the left among the stable ones without
+            segments.
+        max_arcs: Room for the arcs of one loop, as for `find_cycle`.
+
+    Returns:
+        The `Cycle`. Where there is none, or none of this sort, its status is NO_UNSTABLE_CYCLE;
+        under `jit`, `vmap` and derivatives also where another cycle attracts close outside of it.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(osc)
+    refuse_clock(osc, "unstable_cycle")
     last = most_equilibria(osc) - 1
     is_number = isinstance(around, int | np.integer) and not isinstance(around, bool)
     among = f"0 to {last}" if last else "0"
@@ -64,7 +74,7 @@ def unstable_cycle(osc: Oscillator, *, around: int = 0, max_arcs: int | None = N
 
 
 def from_starts(osc: Oscillator, *, around: int = 0, room: int = SIZES[0]) -> Cycle:
-    """`unstable_cycle` by one program, as it is under `jit`: from starts near the equilibrium."""
+    """`unstable_cycle` by one program, as under `jit`: from starts near the equilibrium."""
     loop, status, distance = separating_loop(osc, room, around)
     return _if_meant(exactly(osc, loop, status), loop, distance)
 
@@ -86,14 +96,14 @@ def _eligible(rests: Equilibria) -> Array:
 
 
 def _is_sought(cycle: Cycle, x1: float) -> bool:
-    """Whether it repels, sticks to nothing and goes round a place."""
+    """Whether it repels, sticks to nothing and goes around a place."""
     slips = not np.any(modes_of(arcs_of(cycle)[0]) == STUCK)
     low, high, *_ = place_of(cycle)
     return float(cycle.multiplier) > 1 and slips and bool(low < x1 < high)
 
 
 def separating_loop(osc: Oscillator, size: int, around: int = 0) -> tuple[Loop, Array, Array]:
-    """A loop near the unstable cycle, a status, and how far from the equilibrium it begins."""
+    """A loop near the unstable cycle, a status, and its distance from the equilibrium."""
     return _separating_loop(osc, candidates(osc), jnp.asarray(np.array(around)), size)
 
 

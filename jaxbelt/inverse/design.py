@@ -28,7 +28,7 @@ from ..checks import (
     traceable,
 )
 from ..cycles.cycle import Cycle, cycle_from, cycle_of_zeros
-from ..model.oscillator import Oscillator, check_oscillator
+from ..model.oscillator import Oscillator, check_oscillator, refuse_clock
 from ..model.parameters import leaf_index
 from ..numerics.compiling import jit
 from ..results import Status, describe, draw
@@ -180,6 +180,7 @@ def design(
         ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(oscillator, "oscillator")
+    refuse_clock(oscillator, "design", "jax.grad of jb.simulate")
     y0 = as_array(y0, "y0", (2,))
     check_finite(y0, "y0")
     functionals, intervals = _checked_targets(targets)

@@ -34,7 +34,7 @@ from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
 from ..checks import as_array, as_whole, check_finite, outside_of_traces, require, require_value
-from ..model.oscillator import Oscillator, check_oscillator
+from ..model.oscillator import Oscillator, check_oscillator, refuse_clock
 from ..model.own_units import in_own_units, own_length, quantity, rescaled
 from ..motion.simulate import simulate
 from ..numerics.compiling import jit
@@ -403,6 +403,7 @@ def fit(
         ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(oscillator, "oscillator")
+    refuse_clock(oscillator, "fit", "jax.grad of jb.simulate")
     times, values, sigmas = _checked_record(ts, x1, x2, noise)
     starts = as_whole(starts, "starts")
     note = progress_reporter(report)

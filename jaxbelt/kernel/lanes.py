@@ -31,7 +31,7 @@ class Lanes(eqx.Module):
     that the last error would have allowed; mode; events: how many there were; status; done. lower,
     upper: extrema of x2 since the observer reset them, where it asks for extrema. memory: the
     observer's. integrals: of the rates that it gives to the steps, see `Observer.follow`, from 0
-    to t.
+    to t. hit: with a clock, the guard that a lane has landed on, as numbered in `instants`, or -1.
     """
 
     run: Array
@@ -50,6 +50,7 @@ class Lanes(eqx.Module):
     upper: Array
     memory: Any
     integrals: Any = None
+    hit: Any = None
 
 
 class Passage(eqx.Module):
@@ -195,8 +196,8 @@ class Program(eqx.Module):
 
     structure: of the oscillator's tree; mapped: which of its leaves differ from run to run; edges:
     whether a contact edge may be met; captures: whether a run ends where a pseudo-focus captures
-    it; derivatives: whether those of the results are wanted, too. made_of: what tells apart
-    programs whose code of the user's own is the same, and what it reads is not.
+    it; derivatives: whether derivatives of the results are computed, too. made_of: distinguishes
+    programs whose user code is the same, but reads different values.
     """
 
     structure: Any = eqx.field(static=True)

@@ -91,7 +91,8 @@ class _Tableau(NamedTuple):
 
 
 @functools.cache
-def _nystroem() -> _Tableau:
+def nystroem() -> _Tableau:
+    """The weights of the steps."""
     # Order eight takes twice the stages of order five and a third of the steps at 1e-8, and most of
     # a step's cost is not in its stages but in its interpolant, bounds and choices.
     tableau = the_solvers().Dopri8.tableau
@@ -166,11 +167,12 @@ def _bounds_of_x2(window: _Window, ones: Array, lanes: Lanes) -> tuple[Array, Ar
 
 def _quotient(osc: Oscillator, window: _Window, ones: Array, x1: Array, x2: Array) -> Array:
     """`oscillator.acceleration` as a single quotient; ones: see `lanes.materialise`."""
-    return _as_quotient(osc, window.signs, window.pulls, ones, x1, x2)
+    return as_quotient(osc, window.signs, window.pulls, ones, x1, x2)
 
 
 @jax.custom_jvp
-def _as_quotient(osc: Oscillator, signs, pulls, ones: Array, x1: Array, x2: Array) -> Array:
+def as_quotient(osc: Oscillator, signs, pulls, ones: Array, x1: Array, x2: Array) -> Array:
+    """`oscillator.acceleration` as a single quotient; pulls: the signs times the loads."""
     numerator, denominator = -x1 - osc.damping * x2, ones
     for push in constant_force(osc):
         numerator = numerator + push
@@ -181,7 +183,7 @@ def _as_quotient(osc: Oscillator, signs, pulls, ones: Array, x1: Array, x2: Arra
     return numerator / denominator
 
 
-@functools.partial(_as_quotient.defjvp, symbolic_zeros=True)
+@functools.partial(as_quotient.defjvp, symbolic_zeros=True)
 def _(primals, tangents):
     """The slope of each belt's force has a division, so it is computed once for all directions. One
     more division keeps their sum."""
@@ -199,7 +201,7 @@ def _(primals, tangents):
         total = total + slope * _sum_of_changes(*relative)
         total = total + _sum_of_changes((top * bottom / square, d_pull))
         total = total + pull * _change_of_law(law, d_belt.friction, speed, square)
-    return _as_quotient(*primals), materialise(total, ones)
+    return as_quotient(*primals), materialise(total, ones)
 
 
 def _sum_of_changes(*pairs: tuple[Any, Any]) -> Any:
@@ -224,7 +226,7 @@ def _change_of_law(law: AbstractFriction, change: Any, speed: Array, square: Arr
     return (d_top * bottom - top * d_bottom) / square
 
 
-def _combine(weights: np.ndarray, arrays: Sequence[Array]) -> Array:
+def combine(weights: np.ndarray, arrays: Sequence[Array]) -> Array:
     """The weighted sum of the first arrays, without those of weight 0."""
     terms = [w * array for w, array in zip(weights.tolist(), arrays, strict=False) if w != 0]
     return functools.reduce(jnp.add, terms)
@@ -248,26 +250,26 @@ def attempt(
     """One Runge-Kutta step of all lanes; rates, derivatives: see `take_step`."""
     x1, x2, stages = lanes.x1, lanes.x2, [lanes.a]
     slopes = [rates(osc, lanes.mode, lanes.t, x1, x2)] if rates else []
-    own = _nystroem()
+    own = nystroem()
     for row, row1, c in zip(own.a[1:-1], own.aa[1:-1], own.c[1:-1].tolist(), strict=True):
-        drift = c * x2 + h * _combine(row1, stages) if np.any(row1) else c * x2
-        x2_stage = x2 + h * _combine(row, stages)
+        drift = c * x2 + h * combine(row1, stages) if np.any(row1) else c * x2
+        x2_stage = x2 + h * combine(row, stages)
         stages.append(_quotient(osc, window, ones, x1 + h * drift, x2_stage))
         if rates:
             slopes.append(rates(osc, lanes.mode, lanes.t + c * h, x1 + h * drift, x2_stage))
     # The weights of the solution are those of the last stage, which is the next step's first.
-    y1 = materialise(x1 + h * (x2 + h * _combine(own.aa[-1], stages)), ones)
-    y2 = materialise(x2 + h * _combine(own.a[-1], stages), ones)
+    y1 = materialise(x1 + h * (x2 + h * combine(own.aa[-1], stages)), ones)
+    y2 = materialise(x2 + h * combine(own.a[-1], stages), ones)
     stages.append(_quotient(osc, window, ones, y1, y2))
     scale1 = atol + rtol * jnp.maximum(jnp.abs(x1), jnp.abs(y1))
     scale2 = atol + rtol * jnp.maximum(jnp.abs(x2), jnp.abs(y2))
-    error1, error2 = jnp.abs(h * h * _combine(own.ea, stages)), jnp.abs(h * _combine(own.e, stages))
+    error1, error2 = jnp.abs(h * h * combine(own.ea, stages)), jnp.abs(h * combine(own.e, stages))
     error = jnp.maximum(error1 * scale2, error2 * scale1) / (scale1 * scale2)
     if derivatives:
         ends = (x1, x2), (y1, y2)
         fastest = functools.reduce(jnp.maximum, [_rate(osc, window, ones, *end) for end in ends])
         error = jnp.maximum(error, own.linear / rtol * ((h * fastest) ** 2) ** 4)
-    integrals = jax.tree.map(lambda i, *s: i + h * _combine(own.a[-1], s), lanes.integrals, *slopes)
+    integrals = jax.tree.map(lambda i, *s: i + h * combine(own.a[-1], s), lanes.integrals, *slopes)
     return _Attempt(h, y1, y2, stages[-1], lax.stop_gradient(error), integrals)
 
 
@@ -488,7 +490,7 @@ def take_step(
     moves = lands & ~is_at_rest(x1, x2, a_end)
     delta, x1, x2 = _with_its_derivatives(moves, at.on_edge, delta, bound, new, (x1, x2, a_end))
     t = jnp.where(last & ~lands, t1, lanes.t + h + delta)
-    pace, proposed = _next_size(lanes, new, going, accepted)
+    pace, proposed = next_size(lanes, new, going, accepted)
     stands = shortened & (at.theta * h < NO_STEP)
     proposed = jnp.where(shortened, at.theta * h, proposed)
     proposed = jnp.where(stands, NO_STEP, proposed)
@@ -552,7 +554,7 @@ def _integrated(rates, osc, lanes: Lanes, new: _Attempt, delta, x1, x2, kept) ->
     return choose(kept, totals, lanes.integrals)
 
 
-def _next_size(lanes: Lanes, new: _Attempt, going, accepted) -> tuple[Array, Array]:
+def next_size(lanes: Lanes, new: _Attempt, going, accepted) -> tuple[Array, Array]:
     """The lanes' pace after a step, and the size of the next one by its error."""
     # NaN is a large error, too; the error is of order eight in h.
     error = jnp.where(new.error < LARGEST_ERROR, jnp.maximum(new.error, LEAST_ERROR), LARGEST_ERROR)

@@ -41,8 +41,9 @@ from .modes import (
     kinetic_capacity,
     mode_acceleration,
     settle,
+    zone_ends,
 )
-from .oscillator import Oscillator, check_oscillator, has_possible_numbers
+from .oscillator import Oscillator, check_oscillator, has_possible_numbers, refuse_clock
 from .own_units import in_given_units, in_own_units, quantity
 from .pseudofocus import edge_focus
 from .rest import is_centre
@@ -64,30 +65,35 @@ class EquilibriumKind(enum.IntEnum):
 class Equilibria(eqx.Module):
     """The equilibria (x1, 0) from left to right; what `equilibria` returns.
 
-    Arrays with a row each; under a transformation padded to a common length (four a belt, and
-    one), outside cut to what there is. `equilibria(osc)[i]` is one row, a loop runs over them.
+    Arrays have a row for each equilibrium; under a transformation they are padded to a common
+    length (four for each belt, and one), outside cut to the existing rows. `equilibria(osc)[i]` is
+    one row, and a loop runs over the rows.
 
-    - kind: an `EquilibriumKind`, [equilibria] (0 where padded).
-    - x1: position, of a segment its middle, [equilibria] (NaN where padded, like all below).
-    - x1_lower, x1_upper: ends of a segment, else both x1.
-    - modes: contact codes, [equilibria, belts] (+1/-1 slip with that sign of r_i, 0 stuck, -2/+2
-      mass below/above the belt's interval; all 0 where padded). At a pseudo-focus and a saddle
-      those of the left-hand side of the edge.
-    - jacobian: of the field of the mode at a fixed point, [equilibria, 2, 2], else NaN.
-    - eigenvalues: its eigenvalues, eqs. (25) and (26) of the paper, the one with the larger real
-      or imaginary part first, complex [equilibria, 2], else NaN.
-    - rate: small disturbances behave like exp(rate t): the largest real part of the eigenvalues at
-      a fixed point; at a pseudo-focus `(tr_L/a_L + tr_R/|a_R|) / (3 (1/a_L + 1/|a_R|))`, or -inf
-      where a belt at rest touches, which ends them in a finite time; inf at a saddle, which is
-      left in a finite time; NaN for a segment.
-    - stable: rate < 0. A segment is stable if small disturbances of some part of it stay small and
-      end in it again. That is where the needed force is less than the sum of u0_k mu_k(0); the
-      rest of a segment, if mu(0) is less than the static limit, holds but does not attract, unless
-      an edge ends it beyond which the mass, having slipped away, is pushed back. A mass that slips
-      away and comes back only after a large motion is no sign of stability.
-    - neutral: a centre: orbits around it are closed, so it neither attracts nor repels, and is not
-      stable in the sense above. It is where the forces on each side are the same at x2 and -x2, as
-      without damping and with friction that does not depend on the speed.
+    A segment is stable if small disturbances of some part of it stay small and end in it again. In
+    that part the needed force is less than the sum of u0_k mu_k(0); the rest of a segment, if mu(0)
+    is less than the static limit, holds but does not attract, unless an edge ends it beyond which
+    the mass, having slipped away, is pushed back. A mass that slips away and comes back only after
+    a large motion does not make a segment stable.
+
+    Attributes:
+        kind: An `EquilibriumKind`, [equilibria] (0 where padded).
+        x1: Position, for a segment its middle, [equilibria] (NaN where padded, like all below).
+        x1_lower: Lower end of a segment, else x1.
+        x1_upper: Upper end of a segment, else x1.
+        modes: Contact codes, [equilibria, belts] (+1/-1 slip with that sign of r_i, 0 stuck, -2/+2
+            mass below/above the belt's interval; all 0 where padded). At a pseudo-focus and a
+            saddle those of the left-hand side of the edge.
+        jacobian: Jacobian of the field of the mode at a fixed point, [equilibria, 2, 2], else NaN.
+        eigenvalues: Its eigenvalues, eqs. (25) and (26) of the paper, the one with the larger real
+            or imaginary part first, complex [equilibria, 2], else NaN.
+        rate: Small disturbances behave like exp(rate t). The largest real part of the eigenvalues
+            at a fixed point; at a pseudo-focus `(tr_L/a_L + tr_R/|a_R|) / (3 (1/a_L + 1/|a_R|))`,
+            or -inf where a belt at rest touches, which ends them in a finite time; inf at a saddle,
+            which is left in a finite time; NaN for a segment.
+        stable: Whether rate < 0; for segments see above.
+        neutral: Whether it is a centre: orbits around it are closed, so it neither attracts nor
+            repels. That is where the forces on each side are the same at x2 and -x2, as without
+            damping and with friction that does not depend on the speed.
     """
 
     kind: Array
@@ -111,10 +117,12 @@ class Equilibria(eqx.Module):
         return (self[i] for i in range(len(self)))
 
     def table(self) -> "pandas.DataFrame":
-        """A row for each, from left to right: kind (the name of an `EquilibriumKind`), stable,
-        neutral, x1, x1_lower, x1_upper, rate, frequency (the imaginary part of the first
-        eigenvalue: small disturbances turn with it), and contact_0, contact_1, ..., the contact
-        code of each belt."""
+        """Returns a row for each equilibrium, from left to right.
+
+        Columns: kind (the name of an `EquilibriumKind`), stable, neutral, x1, x1_lower, x1_upper,
+        rate, frequency (the imaginary part of the first eigenvalue, with which small disturbances
+        rotate), and contact_0, contact_1, ..., the contact code of each belt.
+        """
         require_single(self, self.kind, 0, 1)
         rows = jax.tree.map(np.asarray, self)
         if self.kind.ndim == 0:
@@ -134,8 +142,14 @@ class Equilibria(eqx.Module):
         return table_of({n: x if n == "kind" else np.asarray(x)[here] for n, x in names.items()})
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw them in the phase plane, on its line x2 = 0, into the axes `ax` (None: new ones),
-        which are returned."""
+        """Draws the equilibria in the phase plane, on its line x2 = 0.
+
+        Args:
+            ax: Axes; None makes new ones.
+
+        Returns:
+            The axes.
+        """
         return draw(self, ax)
 
     def __repr__(self) -> str:
@@ -157,39 +171,46 @@ def _row_text(row: Equilibria) -> str:
 
 
 def stability(row: Equilibria) -> str:
-    """What one row is called."""
+    """Word for the stability of one row."""
     return "stable" if row.stable else "neutral" if row.neutral else "unstable"
 
 
 @announced("equilibria")
 def equilibria(osc: Oscillator) -> Equilibria:
-    """All equilibria of the oscillator, saddles among them, sorted by x1: see `Equilibria` for what
-    is known of each.
+    """All equilibria of the oscillator, saddles among them, sorted by x1.
 
-    osc: `Oscillator` with any friction laws, any number of belts and any contact intervals. Works
-    under `jax.jit`, `jax.vmap` and derivatives; nothing raises there. `ValueError` names a
-    parameter that is impossible.
+    Works under `jax.jit`, `jax.vmap` and derivatives; nothing raises there. A segment that reaches
+    across a contact edge is given in pieces, one for each zone, each with its own contact codes. A
+    fixed point that lies on an edge, up to rounding, is listed with the zone that it belongs to, of
+    two with the left one, and its eigenvalues are those of that side alone; it is stable where
+    these are and the other side does not push away from it.
 
-    A segment that reaches across a contact edge is given in pieces, one a zone, each with its own
-    contact codes. A fixed point on an edge, but for rounding, is listed with the zone that it
-    belongs to, of two with the left one, and its eigenvalues are those of that side alone; it is
-    stable where these are and the other side does not push away from it.
+    Args:
+        osc: The oscillator, with any friction laws, any number of belts and any contact intervals.
+
+    Returns:
+        The `Equilibria`.
+
+    Raises:
+        ValueError: If a parameter is impossible; the message names it.
     """
     check_oscillator(osc)
+    refuse_clock(osc, "equilibria", "jb.simulate")
     own = in_own_units(osc)
     found = _all_candidates(own)
     return in_given_units(_existing(found, found), osc, own)
 
 
 def _existing(rows, found: Equilibria):
-    """Cut the padding off where it is known, that is, outside of transformations."""
+    """Cuts the padding off where it is known, that is, outside of transformations."""
     if not is_concrete((rows, found)):
         return rows
     return pick(rows, slice(int(np.sum(np.asarray(found.kind) > 0))))
 
 
 def most_equilibria(osc: Oscillator) -> int:
-    """How many equilibria there may be: one a zone and one an edge, as far as edges are known."""
+    """Largest possible number of equilibria: one for each zone and each edge, as far as edges
+    are known."""
     places = edges(osc)
     if is_concrete(places):
         places = [place for place in set(map(float, places)) if np.isfinite(place)]
@@ -198,20 +219,22 @@ def most_equilibria(osc: Oscillator) -> int:
 
 @jit
 def candidates(osc: Oscillator) -> Equilibria:
-    """Where the mass can rest, all but saddles: one row a zone and one an edge, sorted; those
-    without an equilibrium come last as NaN."""
+    """States of rest, without saddles: one row for each zone and each edge, sorted.
+
+    Rows without an equilibrium come last, as NaN.
+    """
     return _rows_of(osc, with_saddles=False)
 
 
 @jit
 def _all_candidates(osc: Oscillator) -> Equilibria:
-    """Where the mass can rest, saddles included, as `candidates`."""
+    """States of rest and saddles, as `candidates`."""
     return _rows_of(osc, with_saddles=True)
 
 
 def _rows_of(osc: Oscillator, *, with_saddles: bool) -> Equilibria:
     positions = jnp.sort(jnp.stack(edges(osc)))
-    zones, points = _in_zones(osc, positions), _at_edges(osc, positions, with_saddles=with_saddles)
+    zones, points = _in_zones(osc), _at_edges(osc, positions, with_saddles=with_saddles)
     rows = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), zones, points)
     return rows[jnp.argsort(rows.x1)]
 
@@ -219,9 +242,8 @@ def _rows_of(osc: Oscillator, *, with_saddles: bool) -> Equilibria:
 # --- within the zones: fixed points and segments ------------------------------------------------
 
 
-def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
-    end = jnp.full(1, jnp.inf)
-    lower, upper = jnp.concatenate([-end, positions]), jnp.concatenate([positions, end])
+def _in_zones(osc: Oscillator) -> Equilibria:
+    lower, upper = zone_ends(osc)
     rest = jnp.zeros_like(lower)
     mode = contact(osc, lower, rest, rightward=True)
     held = capacity(osc, mode)
@@ -237,8 +259,8 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
     rounding = edge_rounding(pull, 1.0 + held)
     is_fixed = possible & (held == 0) & (lower - rounding < pull) & (pull < upper + rounding)
     on_lower, on_upper = (jnp.abs(pull - edge) < rounding for edge in (lower, upper))
-    # On an edge beyond which belts at rest hold the mass it is the end of that segment; and what
-    # lies there for either side is listed with the left one.
+    # On an edge beyond which belts at rest hold the mass it is the end of that segment; an
+    # equilibrium of both sides is listed with the left one.
     is_fixed &= ~(on_lower & (up_from_below == 0)) & ~(on_upper & held_above)
     first, last = jnp.maximum(pull - held, lower), jnp.minimum(pull + held, upper)
     at_first, at_last = first - lower < rounding, upper - last < rounding
@@ -255,7 +277,7 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
 
     kinetic = kinetic_capacity(osc, mode)
     attracts = jnp.maximum(pull - kinetic, lower) < jnp.minimum(pull + kinetic, upper)
-    # Or what slips away passes an edge, is pushed back to it, and stops where it came from.
+    # Or a mass that slips away passes an edge, is pushed back to it, and stops where it came from.
     attracts |= at_first & (up_from_below > 0)
     attracts |= at_last & (down_from_above > 0)
 
@@ -280,20 +302,25 @@ def _in_zones(osc: Oscillator, positions: Array) -> Equilibria:
 
 
 def _outside_of(osc: Oscillator, edge: Array, *, rightward: bool) -> tuple[Array, Array]:
-    """Whether the mass is held just beyond an edge, and x2' there, 0 where it is."""
+    """Whether the mass is held just beyond an edge, and x2' there, 0 where it is held."""
     mode, pull = at_rest_beside(osc, jnp.where(jnp.isfinite(edge), edge, 0.0), rightward=rightward)
     return mode.any_stuck, jnp.where(mode.any_stuck, 0.0, pull)
 
 
 def edge_rounding(x1: Array, scale: Array | float = 1.0) -> Array:
-    """Nearer to a contact edge than this a fixed point lies on it: x1 and forces of size `scale`
-    are good to some 1e-16 of themselves, and nothing is integrated, see `force_rounding`."""
+    """Distance from a contact edge up to which a fixed point lies on it.
+
+    x1 and forces of size `scale` are good to some 1e-16 of themselves, and nothing is integrated,
+    see `force_rounding`.
+    """
     return 1e-14 * (scale + jnp.abs(x1))
 
 
 def at_rest_beside(osc: Oscillator, x1: Array, *, rightward: bool) -> tuple[Mode, Array]:
-    """The mode of a mass at rest just beside each x1, [places], on that side, and x2' there, which
-    is 0 for a fixed point, but for rounding; its derivatives stay."""
+    """The mode of a mass at rest just beside each x1, [places], on one side, and x2' there.
+
+    x2' is 0 for a fixed point, up to rounding; its derivatives stay.
+    """
     rest = jnp.zeros_like(x1)
     mode = settle(osc, contact_beside(osc, x1, rest, rightward=rightward), x1, rest)
     a = mode_acceleration(osc, mode, x1, rest)
@@ -359,7 +386,7 @@ def _eigenvalues(matrix: Array) -> Array:
 
 def _at_edges(osc: Oscillator, positions: Array, *, with_saddles: bool) -> Equilibria:
     before = jnp.concatenate([jnp.full(1, -jnp.inf), positions[:-1]])
-    # Edges at one place count once, but for rounding; finite numbers stand in for infinite ones.
+    # Edges at one place count once, up to rounding; finite numbers stand for infinite ones.
     is_edge = jnp.isfinite(positions) & (positions - before > force_rounding(positions))
     x1 = jnp.where(is_edge, positions, 0.0)
     rest = jnp.zeros_like(x1)
@@ -395,7 +422,7 @@ def _at_edges(osc: Oscillator, positions: Array, *, with_saddles: bool) -> Equil
 
 
 def repelling_foci(osc: Oscillator) -> Array:
-    """x1 of the pseudo-foci that repel, a row an edge, NaN where there is none."""
+    """x1 of the pseudo-foci that repel, a row for each edge, NaN where there is none."""
     found = _at_edges(osc, jnp.sort(jnp.stack(edges(osc))), with_saddles=False)
     return jnp.where((found.rate > 0) & ~found.neutral, found.x1, jnp.nan)
 
@@ -407,22 +434,30 @@ def repelling_foci(osc: Oscillator) -> Array:
 def lyapunov_coefficient(osc: Oscillator) -> Array:
     """First Lyapunov coefficient a of each fixed point; positive: the Hopf point is subcritical.
 
-    osc: `Oscillator` at a Hopf point, where the trace of the Jacobian is 0. Returns one number for
-    each row of `equilibria(osc)`, [equilibria], NaN where that is no fixed point. Elsewhere the
-    number still tells of the Hopf point nearby.
-
     The normalisation is that of J. Guckenheimer and P. Holmes, Nonlinear Oscillations, Dynamical
-    Systems, and Bifurcations of Vector Fields (1983), eq. (3.4.11): the amplitude r of x1 obeys
-    r' = (trace/2) r + a r^3, so near the Hopf point there is a cycle with r^2 = -(trace/2)/a. The
-    l1 of Yu. A. Kuznetsov, Elements of Applied Bifurcation Theory, with eigenvectors of unit
-    length, is 2 a.
+    Systems, and Bifurcations of Vector Fields (1983), eq. (3.4.11): the amplitude r of x1 obeys r'
+    = (trace/2) r + a r^3, so near the Hopf point there is a cycle with r^2 = -(trace/2)/a. The l1
+    of Yu. A. Kuznetsov, Elements of Applied Bifurcation Theory, with eigenvectors of unit length,
+    is 2 a.
 
     Their formula needs the linear part to be a rotation. It is one with unit frequency: the
-    derivatives of x2' by x1 and x2 are -1 and the trace. And x1' = x2 and the spring are linear,
-    so of its ten derivatives only two do not vanish, d^2 x2'/dx2^2, which enters in products with
+    derivatives of x2' by x1 and x2 are -1 and the trace. And x1' = x2 and the spring are linear, so
+    of its ten derivatives only two do not vanish, d^2 x2'/dx2^2, which enters in products with
     vanishing ones only, and d^3 x2'/dx2^3: a = (d^3 x2'/dx2^3) / 16.
+
+    Args:
+        osc: The oscillator at a Hopf point, where the trace of the Jacobian is 0. Elsewhere the
+            number still describes the Hopf point nearby.
+
+    Returns:
+        One number for each row of `equilibria(osc)`, [equilibria], NaN where that is no fixed
+        point.
+
+    Raises:
+        ValueError: If a parameter is impossible; the message names it.
     """
     check_oscillator(osc)
+    refuse_clock(osc, "lyapunov_coefficient")
     own = in_own_units(osc)
     found, coefficients = _lyapunov_coefficients(own)
     return _existing(coefficients, found) / (1 if own is osc else own.units.length**2)

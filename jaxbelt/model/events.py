@@ -1,8 +1,8 @@
 """Events, the changes of mode, and signatures, the events of one loop.
 
-`simulate`, the orbits behind cycles and sweeps all name their events by `event_between`. A cycle
-tells its signature as it begins; where two are compared, or one is named, it is brought to the same
-order first, by `of_one_loop`.
+`simulate`, the orbits behind cycles and sweeps all name their events by `event_between`. The
+signature of a cycle begins where the cycle begins; where two are compared, or one is named, they
+are brought to the same order first, by `of_one_loop`.
 """
 
 from collections.abc import Sequence
@@ -24,8 +24,8 @@ def event_between(before: Sequence[Any], after: Sequence[Any]) -> tuple[Any, Any
 
     before, after: contact codes, an array a belt, of JAX or of NumPy, any common shape. Where a
     belt comes or goes it is an EDGE, whatever else changes; else a STICK where one is stuck
-    afterwards only, a SLIP where one was before only, else a CROSS. Of several belts concerned the
-    lowest is told.
+    afterwards only, a SLIP where one was before only, else a CROSS. Of several belts the lowest
+    is named.
     """
     pairs = list(zip(before, after, strict=True))
     changes = {

@@ -53,7 +53,7 @@ def _growth(law: AbstractFriction, r: float = FAST[1]) -> tuple[Array, Array]:
 
 
 def has_limit(law: AbstractFriction) -> Array:
-    """Whether its growth is told by these numbers: that of a square root, say, is not."""
+    """Whether these numbers determine its growth: those of a square root do not."""
     pairs = zip(*(_growth(law, r) for r in FAST), strict=True)
     return jnp.all(jnp.stack([jnp.abs(a - b) <= 1e-4 * (a + b) for a, b in pairs]))
 

@@ -1,15 +1,15 @@
-"""Forcing: what knows the time, forces on the mass, and belts and loads that oscillate.
+"""Forcing: forces on the mass, and velocities and loads of belts, that depend on the time.
 
-The mass may be pushed by forces F_j(tau) that depend on the dimensionless time tau = omega t alone,
+Forces F_j(tau) may push the mass; they depend on the dimensionless time tau = omega t alone,
 
     x2' = -x1 - zeta x2 + (friction of the touching belts) + sum of F_j(tau),
 
 and a belt's velocity and load may oscillate. Forces are measured like loads, over the stiffness, so
 they are lengths. Frequencies are angular ones in the time tau: the natural frequency is 1.
 
-A force of one's own is a subclass of `AbstractForce` with `frequency` and `force(t)`. A frequency
-that is known to be 0 makes a constant force, or a constant velocity or load; then the oscillator
-has no clock, and all of this package takes it.
+A user's force is a subclass of `AbstractForce` with `frequency` and `force(t)`. A frequency that is
+known to be 0 makes a constant force, or a constant velocity or load; then the oscillator has no
+clock, and all of this package takes it.
 """
 
 import abc
@@ -35,15 +35,15 @@ from ..checks import (
 )
 
 
-def _scalar(name: str) -> Callable[[Any], Array]:
+def _number_named(name: str) -> Callable[[Any], Array]:
     return lambda value: as_array(value, name)
 
 
 class _Wave(eqx.Module):
-    """What all classes of this module have: rules, and a text that makes them again."""
+    """Base of all classes of this module: rules, and a text that constructs them again."""
 
     def rules(self) -> list[Rule]:
-        """What its parameters have to be; a force of one's own may add to them."""
+        """Conditions on its parameters; a user's force may add to them."""
         named = [(name, value) for name, value in vars(self).items() if eqx.is_inexact_array(value)]
         return [
             rule
@@ -52,7 +52,7 @@ class _Wave(eqx.Module):
         ]
 
     def check(self, owner: str) -> None:
-        """Raise a `ValueError` naming `owner` where a known parameter is out of range."""
+        """Raises a `ValueError` naming `owner` if a known parameter is out of range."""
         for rule in type(self).rules(self):
             rule.enforce(f" of {owner}")
 
@@ -65,32 +65,42 @@ class _Wave(eqx.Module):
 
 
 class AbstractForce(_Wave):
-    """A periodic force on the mass: subclass it with `frequency` and `force` for one of your own.
+    """A periodic force on the mass: subclass it with `frequency` and `force` to define your own.
 
-    `frequency` is that of its period 2 pi / frequency, an angular frequency in the time tau.
+    Attributes:
+        frequency: Angular frequency in the time tau; the period is 2 pi / frequency.
 
     Example:
-        class Pulses(jb.AbstractForce):
-            size: jax.Array
-            frequency: jax.Array
+        A short push in each period::
 
-            def force(self, t):
-                return self.size * jnp.exp(3 * (jnp.cos(self.frequency * t) - 1))
+            class Pulses(jb.AbstractForce):
+                size: jax.Array
+                frequency: jax.Array
+
+                def force(self, t):
+                    return self.size * jnp.exp(3 * (jnp.cos(self.frequency * t) - 1))
     """
 
     frequency: eqx.AbstractVar[Array]
 
     @abc.abstractmethod
     def force(self, t: Array) -> Array:
-        """The force over the stiffness at the time t, a scalar; smooth, and made of `jax.numpy`."""
+        """The force over the stiffness; smooth, and made of `jax.numpy`.
+
+        Args:
+            t: Time tau, a scalar.
+
+        Returns:
+            The force, a scalar.
+        """
 
     @property
     def fastest(self) -> Array:
-        """The highest frequency in it that counts; steps are short against its period."""
+        """The highest frequency in it that matters; steps are short against its period."""
         return 8.0 * self.frequency
 
     def bound(self, damping: ArrayLike) -> Array:
-        """A bound of |force| for all times; inf where none is known."""
+        """A bound of the size of the force for all times; inf where none is known."""
         return jnp.asarray(jnp.inf)
 
     def on_mass(self, t: Array, damping: Array) -> Array:
@@ -103,7 +113,7 @@ class AbstractForce(_Wave):
 
 
 class ForceInUnits(AbstractForce):
-    """A force of one's own in other units: force(t) is that of `own` at time t, over unit."""
+    """A user's force in other units: force(t) is that of `own` at time t, over unit."""
 
     own: AbstractForce
     unit: Array
@@ -112,7 +122,7 @@ class ForceInUnits(AbstractForce):
     def __init__(self, own: AbstractForce, unit: Any, time: Any):
         self.own, self.unit, self.time = own, jnp.asarray(unit), jnp.asarray(time)
 
-    # The force's own: a copy would be a parameter of its own.
+    # The force's own value: a copy would be a further parameter.
     @property
     def frequency(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.own.frequency * self.time
@@ -136,9 +146,9 @@ class ForceInUnits(AbstractForce):
 
 
 class ConstantForce(AbstractForce):
-    """A constant force, as of an incline: what `Harmonic` is with the frequency 0. No clock."""
+    """A constant force, as of an incline: a `Harmonic` with the frequency 0. No clock."""
 
-    amplitude: Float[Array, ""] = eqx.field(converter=_scalar("amplitude"))
+    amplitude: Float[Array, ""] = eqx.field(converter=_number_named("amplitude"))
 
     @property
     def frequency(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -161,14 +171,18 @@ class ConstantForce(AbstractForce):
 class Harmonic(AbstractForce):
     """A harmonic force, amplitude cos(frequency tau + phase).
 
-    Arguments, dimensionless scalars: amplitude F (force over stiffness, a length), frequency >= 0
-    (angular, in the time tau = omega t; 0 makes a constant force), phase (default 0). `ValueError`
-    for anything else.
+    Args:
+        amplitude: F, force over stiffness, a length.
+        frequency: Angular frequency >= 0 in the time tau = omega t; 0 makes a constant force.
+        phase: Phase at tau = 0, default 0.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
 
-    amplitude: Float[Array, ""] = eqx.field(converter=_scalar("amplitude"))
-    frequency: Float[Array, ""] = eqx.field(converter=_scalar("frequency"))
-    phase: Float[Array, ""] = eqx.field(converter=_scalar("phase"), default=0.0)
+    amplitude: Float[Array, ""] = eqx.field(converter=_number_named("amplitude"))
+    frequency: Float[Array, ""] = eqx.field(converter=_number_named("frequency"))
+    phase: Float[Array, ""] = eqx.field(converter=_number_named("phase"), default=0.0)
 
     def __check_init__(self):
         self.check("Harmonic")
@@ -190,19 +204,25 @@ class Harmonic(AbstractForce):
 
 
 class BaseMotion(AbstractForce):
-    """A support that moves by amplitude cos(frequency tau + phase); spring and dashpot end in it.
+    """A support that moves by amplitude cos(frequency tau + phase); spring and dashpot are fixed to
+    it.
 
-    On the mass this is the force X cos(theta) - zeta Omega X sin(theta), of the amplitude
-    X sqrt(1 + zeta^2 Omega^2) and the phase phi + atan(zeta Omega). x1 and x2 stay in the frame of
-    the ground, and so do the belts.
+    On the mass this is the force X cos(theta) - zeta Omega X sin(theta), of the amplitude X sqrt(1
+    + zeta^2 Omega^2) and the phase phi + atan(zeta Omega). x1 and x2 stay in the frame of the
+    ground, and so do the belts.
 
-    Arguments, dimensionless scalars: amplitude X (a length), frequency Omega >= 0 (0: a support
-    that stands elsewhere), phase phi (default 0). `ValueError` for anything else.
+    Args:
+        amplitude: X, a length.
+        frequency: Angular frequency Omega >= 0 in the time tau; 0: a support that is displaced.
+        phase: phi, default 0.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
 
-    amplitude: Float[Array, ""] = eqx.field(converter=_scalar("amplitude"))
-    frequency: Float[Array, ""] = eqx.field(converter=_scalar("frequency"))
-    phase: Float[Array, ""] = eqx.field(converter=_scalar("phase"), default=0.0)
+    amplitude: Float[Array, ""] = eqx.field(converter=_number_named("amplitude"))
+    frequency: Float[Array, ""] = eqx.field(converter=_number_named("frequency"))
+    phase: Float[Array, ""] = eqx.field(converter=_number_named("phase"), default=0.0)
 
     def __check_init__(self):
         self.check("BaseMotion")
@@ -228,23 +248,28 @@ class BaseMotion(AbstractForce):
 
 
 class Oscillating(_Wave):
-    """A velocity or a load of a belt that oscillates: mean + amplitude cos(frequency tau + phase).
+    """An oscillating velocity or load of a belt: mean + amplitude cos(frequency tau + phase).
 
-    Arguments, dimensionless scalars: mean and amplitude (as the velocity or the load), frequency
-    >= 0 (angular, in the time tau; 0 makes a constant), phase (default 0). `ValueError` for
-    anything else.
+    Args:
+        mean: Mean value.
+        amplitude: Amplitude, in the same unit.
+        frequency: Angular frequency >= 0 in the time tau; 0 makes a constant.
+        phase: Phase at tau = 0, default 0.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
 
-    mean: Float[Array, ""] = eqx.field(converter=_scalar("mean"))
-    amplitude: Float[Array, ""] = eqx.field(converter=_scalar("amplitude"))
-    frequency: Float[Array, ""] = eqx.field(converter=_scalar("frequency"))
-    phase: Float[Array, ""] = eqx.field(converter=_scalar("phase"), default=0.0)
+    mean: Float[Array, ""] = eqx.field(converter=_number_named("mean"))
+    amplitude: Float[Array, ""] = eqx.field(converter=_number_named("amplitude"))
+    frequency: Float[Array, ""] = eqx.field(converter=_number_named("frequency"))
+    phase: Float[Array, ""] = eqx.field(converter=_number_named("phase"), default=0.0)
 
     def __check_init__(self):
         self.check("Oscillating")
 
     def value(self, t: Array) -> Array:
-        """What it is at the time t."""
+        """The value at the time t."""
         return self.mean + self.amplitude * jnp.cos(self.frequency * t + self.phase)
 
     def rate(self, t: Array) -> Array:
@@ -263,7 +288,7 @@ class Oscillating(_Wave):
         return duration * (self.mean + self.amplitude * middle * jnp.sinc(half / jnp.pi))
 
     def in_units_of(self, unit: ArrayLike, time: ArrayLike) -> "Oscillating":
-        """The same where these are the units of what oscillates and of time."""
+        """The same wave where these are the units of the value and of time."""
         mean, amplitude, frequency = self.mean / unit, self.amplitude / unit, self.frequency * time
         fields = dict(mean=mean, amplitude=amplitude, frequency=frequency, phase=self.phase)
         return _made(Oscillating, **fields)
@@ -344,14 +369,14 @@ def _without_frequency(force: AbstractForce) -> AbstractForce:
     return ConstantForce(force.amplitude * _cosine(force.phase))
 
 
-#: Forces of one's own whose `force` was traced.
-_traced: set[type] = set()
+#: Users' forces whose `force` was traced.
+_traced_forces: set[type] = set()
 
 
 def _check_force(force: AbstractForce) -> None:
-    """Raise a `ValueError` where `force` of one's own cannot be traced, once for each class."""
+    """Raises a `ValueError` if a user's `force` cannot be traced, once for each class."""
     kind = type(force)
-    if kind.__module__ == __name__ or kind in _traced:
+    if kind.__module__ == __name__ or kind in _traced_forces:
         return
     frequency = getattr(force, "frequency", None)
     fits = eqx.is_array(frequency) or isinstance(frequency, float | int)
@@ -363,4 +388,4 @@ def _check_force(force: AbstractForce) -> None:
 
     found = traceable(at_a_time, f"force of {kind.__name__}", "a function of the time")
     require_one_float(found, f"force of {kind.__name__}", "a function that returns one float64")
-    _traced.add(kind)
+    _traced_forces.add(kind)

@@ -1,11 +1,11 @@
 """Friction laws: the coefficient of friction as a function of the sliding speed.
 
-A law is asked two things: `static`, the coefficient that holds a stuck mass, and `mu(speed)`, the
-coefficient while it slips. A slip mode keeps the sign of its relative velocity (see `modes`), so
-an integrator or a Newton iteration may ask for a speed slightly below zero; each law therefore
-continues smoothly a little beyond its boundary. A law of your own is a subclass of
-`AbstractFriction` with these two. Laws of this module are not checked as those are: they are taken
-to be smooth, and to be traceable.
+A law has two parts: `static`, the coefficient that holds a stuck mass, and `mu(speed)`, the
+coefficient while it slips. A slip mode keeps the sign of its relative velocity (see `modes`), so an
+integrator or a Newton iteration may ask for a speed slightly below zero; each law therefore
+continues smoothly a little beyond its boundary. A user's law is a subclass of `AbstractFriction`
+with these two. The laws of this module are not checked as users' laws are: they are known to be
+smooth and traceable.
 """
 
 import abc
@@ -37,7 +37,7 @@ from ..checks import (
     traceable,
 )
 
-#: What rounding may add to mu(0), over 1 + static.
+#: Rounding that mu(0) may have, over 1 + static.
 MU_ROUNDING = 1e-14
 
 
@@ -46,16 +46,26 @@ def _scalar(name: str) -> Callable[[Any], Array]:
 
 
 class AbstractFriction(eqx.Module):
-    """A friction law: subclass it with `static` and `mu` to use one of your own."""
+    """A friction law: subclass it with `static` and `mu` to define your own.
+
+    Attributes:
+        static: Coefficient mus that holds a stuck mass, a dimensionless scalar.
+    """
 
     static: eqx.AbstractVar[Array]
 
     @abc.abstractmethod
     def mu(self, speed: Array) -> Array:
-        """Kinetic friction coefficient at sliding speed `|nu_R|` (dimensionless, any shape).
+        """Kinetic friction coefficient mu.
 
-        Must be smooth for speed >= 0 and stay finite and smooth slightly below 0; 0 <= mu(0) <=
+        It must be smooth for speed >= 0 and stay finite and smooth slightly below 0; 0 <= mu(0) <=
         static, and the latter two are equal for a law without a jump.
+
+        Args:
+            speed: Sliding speed `|nu_R|`, dimensionless, any shape.
+
+        Returns:
+            The coefficient, of the same shape.
         """
 
     def fraction(self, speed: Array) -> tuple[Array, Array]:
@@ -64,7 +74,7 @@ class AbstractFriction(eqx.Module):
 
     @property
     def measured_to(self) -> ArrayLike:
-        """The speed beyond which it is an extrapolation; inf: nowhere."""
+        """Speed beyond which the law is an extrapolation; inf if there is none."""
         return np.inf
 
     def in_units_of(self, speed: Array) -> "AbstractFriction":
@@ -72,11 +82,11 @@ class AbstractFriction(eqx.Module):
         return LawInUnits(self, speed)
 
     def rules(self) -> list[Rule]:
-        """What its parameters have to be; a law of one's own may add to them."""
+        """Conditions on its parameters; a user's law may add to them."""
         return _of_static(self.static, self.mu(jnp.zeros(jnp.shape(self.static))))
 
     def check(self, owner: str) -> None:
-        """Raise a `ValueError` naming `owner` where a known parameter is out of range."""
+        """Raises a `ValueError` naming `owner` if a known parameter is out of range."""
         for rule in type(self).rules(self):
             rule.enforce(f" of {owner}")
 
@@ -89,10 +99,10 @@ class AbstractFriction(eqx.Module):
 
 
 def _of_static(static: ArrayLike, begins: ArrayLike) -> list[Rule]:
-    """The rules of a law whose mu(0) is that."""
+    """Rules of a law with this mu(0)."""
     most = static + MU_ROUNDING * (1 + static)
     bound = Rule("mu(0)", (begins, static, most), _is_at_most, "<= static = {1}")
-    # A coefficient < 0 pushes: a belt that does holds the mass and lets it go at once.
+    # A negative coefficient pushes: such a belt holds the mass and releases it at once.
     least = Rule("mu(0)", (begins, -MU_ROUNDING), operator.ge, ">= 0")
     return [*be_nonnegative("static", static), least, bound]
 
@@ -101,17 +111,17 @@ def _is_at_most(value: Any, _: Any, most: Any) -> Any:
     return value <= most
 
 
-#: Laws of one's own whose `mu` was traced, and those that were searched for kinks.
+#: Users' laws whose `mu` was traced, and those that were searched for kinks.
 _traced: set[type] = set()
 _asked_of_kinks: set[type] = set()
 
 
 def check_law(law: AbstractFriction) -> None:
-    """Raise a `ValueError` where a law of one's own holds what is no number and not static, or its
-    `mu` cannot be traced, the latter once for each class.
+    """Raises a `ValueError` if a user's law cannot be used.
 
-    A law that asks NumPy for an exponential gives right numbers by itself and fails inside of what
-    is compiled.
+    That is if a field is neither a number nor static, or if its `mu` cannot be traced, the latter
+    once for each class. A law that calls NumPy's exponential returns right numbers alone and fails
+    inside compiled programs.
     """
     kind = type(law)
     if kind.__module__ == __name__:
@@ -135,7 +145,7 @@ def check_law(law: AbstractFriction) -> None:
 
 
 def _warn_of_kink(law: AbstractFriction) -> None:
-    """Warn where a known law of one's own has a jump or a kink, once for each class."""
+    """Warns if a known law of the user has a jump or a kink, once for each class."""
     kind = type(law)
     if kind in _asked_of_kinks or kind.__module__ == __name__ or not is_concrete(law):
         return
@@ -158,19 +168,20 @@ def _warn_of_kink(law: AbstractFriction) -> None:
         warnings.warn(told.format(kind.__name__, *kink), stacklevel=2)
 
 
-#: Speeds between which jumps and kinks are looked for, and how often their intervals are halved.
+#: Speeds between which jumps and kinks are searched, and how often their intervals are halved.
 SEARCHED, HALVINGS = np.logspace(-5, 3, 2049), 30
-#: A slope that jumps by less than this fraction, or by less than this fraction of mu / speed, has
-#: no kink that numbers tell from rounding; mu itself no jump by less than the last fraction.
+#: A slope that jumps by less than LEAST_KINK of itself, or by less than LEAST_BEND of mu / speed,
+#: has no kink beyond rounding; nor has mu a jump if it jumps by less than LEAST_JUMP.
 LEAST_KINK, LEAST_BEND, LEAST_JUMP = 1e-3, 1e-6, 1e-6
 
 
-#: A speed, and what is before and behind it.
+#: A speed, and the values before and behind it.
 Change = tuple[float, float, float]
 
 
 def jump_and_kink(law: AbstractFriction) -> tuple[Change | None, Change | None]:
-    """Where mu of a known law jumps most, and where its slope does; None where it does not."""
+    """The largest jump of mu of a known law, and the largest of its slope; None where there is
+    none."""
     own = law.law if isinstance(law, LawInUnits) else law
     if type(own).__module__ == __name__:
         return None, None  # these are smooth
@@ -184,8 +195,8 @@ def jump_and_kink(law: AbstractFriction) -> tuple[Change | None, Change | None]:
         half = speeds.shape[1]
         return jnp.stack([values[:half], slopes[half:]])
 
-    # Every interval is halved again and again, and the half kept over which the change is the
-    # larger one: without a jump it becomes less and less.
+    # Every interval is halved again and again, and the half with the larger change is kept: without
+    # a jump the change becomes less and less.
     with jax.ensure_compile_time_eval():
         speeds = np.stack([SEARCHED, SEARCHED])
         found = np.asarray(asked(jnp.asarray(speeds)))
@@ -193,7 +204,7 @@ def jump_and_kink(law: AbstractFriction) -> tuple[Change | None, Change | None]:
         mu = after[0]
         for _ in range(HALVINGS):
             middle = 0.5 * (low + high)
-            # As many as before, so that nothing is compiled anew.
+            # As many as before, so that nothing is compiled again.
             filled = np.append(middle, np.ones((2, 1)), axis=1)
             between = np.asarray(asked(jnp.asarray(filled)))[:, :-1]
             left = np.abs(between - before) > np.abs(after - between)
@@ -208,7 +219,8 @@ def jump_and_kink(law: AbstractFriction) -> tuple[Change | None, Change | None]:
 def _largest(
     at: np.ndarray, before: np.ndarray, after: np.ndarray, least: np.ndarray
 ) -> Change | None:
-    """The largest change that is no less than the least, where it is, and from what to what."""
+    """The largest change that is no less than the least: its place, and the values on both
+    sides."""
     changes = np.abs(after - before)
     found = np.flatnonzero(changes > least)
     if not len(found):
@@ -218,7 +230,7 @@ def _largest(
 
 
 def as_friction(law: Any) -> AbstractFriction:
-    """The law, or a `ValueError` where it is none."""
+    """The law, or a `ValueError` if it is none."""
     fits = isinstance(law, AbstractFriction)
     require_value(fits, "friction", "a law such as jb.Conti(...)", law)
     check_law(law)
@@ -235,7 +247,7 @@ class LawInUnits(AbstractFriction):
     def __init__(self, law: AbstractFriction, unit: Array):
         self.law, self.unit = law, unit
 
-    # The law's own: a copy would be a parameter of its own.
+    # The law's own value: a copy would be a further parameter.
     @property
     def static(self) -> ArrayLike:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.law.static
@@ -253,7 +265,7 @@ class LawInUnits(AbstractFriction):
 
     def in_units_of(self, speed: Array) -> AbstractFriction:
         unit = self.unit * speed
-        # There and back again it is the law itself, to rounding.
+        # There and back again it is the law itself, up to rounding.
         is_own = is_concrete(unit) and np.all(np.abs(np.asarray(unit) - 1.0) < 1e-15)
         return self.law if is_own else LawInUnits(self.law, unit)
 
@@ -262,12 +274,19 @@ class LawInUnits(AbstractFriction):
 
 
 class Conti(AbstractFriction):
-    """Conti's law, eqs. (7) and (16) of the paper: mu falls hyperbolically with the speed.
+    """Conti's law: mu falls hyperbolically with the speed.
 
-    mu(r) = (mus - p1) / (1 + p3 r) + p1 + p2 r^2, so mu(0) = mus.
+    Eqs. (7) and (16) of the paper: mu(r) = (mus - p1) / (1 + p3 r) + p1 + p2 r^2, so mu(0) = mus.
+    All arguments are dimensionless scalars.
 
-    Arguments, all dimensionless scalars: static (mus >= 0), residual (p1 >= 0), steepness
-    (p3 >= 0), quadratic (p2, default 0). `ValueError` for anything else.
+    Args:
+        static: mus >= 0.
+        residual: p1 >= 0.
+        steepness: p3 >= 0.
+        quadratic: p2, default 0.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
 
     static: Float[Array, ""] = eqx.field(converter=_scalar("static"))
@@ -298,7 +317,11 @@ class Conti(AbstractFriction):
     def mu(self, speed: Array) -> Array:
         """Kinetic friction coefficient mu(r), eq. (7) of the paper.
 
-        speed: `|nu_R| = |nu - omega x2|` >= 0, dimensionless, any shape. Returns the same shape.
+        Args:
+            speed: Sliding speed r = `|nu_R| = |nu - omega x2|` >= 0, dimensionless, any shape.
+
+        Returns:
+            The coefficient, of the same shape.
         """
         numerator, denominator = self.fraction(speed)
         return numerator / denominator
@@ -307,7 +330,12 @@ class Conti(AbstractFriction):
 class Coulomb(AbstractFriction):
     """Coulomb's law with separate static and kinetic coefficients: mu(r) = kinetic for r > 0.
 
-    Arguments, dimensionless scalars: static >= kinetic >= 0. `ValueError` for anything else.
+    Args:
+        static: Static coefficient, a dimensionless scalar.
+        kinetic: Kinetic coefficient, likewise; static >= kinetic >= 0.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
 
     static: Float[Array, ""] = eqx.field(converter=_scalar("static"))
@@ -330,10 +358,16 @@ class Coulomb(AbstractFriction):
 class Stribeck(AbstractFriction):
     """Stribeck's law with exponential decay: mu(r) = kinetic + (static - kinetic) exp(-r/velocity).
 
-    Arguments, dimensionless scalars: static >= kinetic >= 0, and velocity > 0, the Stribeck
-    velocity. `ValueError` for anything else. Used in this form by L. C. Bo and D. Pavelescu, The
-    friction-speed relation and its influence on the critical velocity of stick-slip motion, Wear
-    82 (1982) 277-289.
+    Used in this form by L. C. Bo and D. Pavelescu, The friction-speed relation and its influence on
+    the critical velocity of stick-slip motion, Wear 82 (1982) 277-289.
+
+    Args:
+        static: Static coefficient, a dimensionless scalar.
+        kinetic: Kinetic coefficient at high speeds, likewise; static >= kinetic >= 0.
+        velocity: Stribeck velocity > 0, likewise.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
 
     static: Float[Array, ""] = eqx.field(converter=_scalar("static"))
@@ -352,7 +386,7 @@ class Stribeck(AbstractFriction):
 
     def mu(self, speed: Array) -> Array:
         """Kinetic friction coefficient mu(r) at speed r >= 0, dimensionless, any shape."""
-        # Cut off below the boundary like Conti's: an exponential overflows there.
+        # Cut off below the boundary like Conti's law: an exponential overflows there.
         decay = jnp.exp(-jnp.maximum(speed / self.velocity, -1.0))
         return self.kinetic + (self.static - self.kinetic) * decay
 
@@ -360,10 +394,17 @@ class Stribeck(AbstractFriction):
 class Cubic(AbstractFriction):
     """A cubic law: mu(r) = a0 - a1 r + a3 r^3, so mu(0) = a0, the static coefficient.
 
-    Arguments, dimensionless scalars: a0 >= 0, a1, a3. `ValueError` for anything else. Used by M. di
-    Bernardo, P. Kowalczyk and A. Nordmark, Sliding bifurcations: a novel mechanism for the sudden
-    onset of chaos in dry friction oscillators, Int. J. Bifurcation Chaos 13 (2003) 2935-2948, with
-    a0 = a1 = 1.5 and a3 = 0.45.
+    Used by M. di Bernardo, P. Kowalczyk and A. Nordmark, Sliding bifurcations: a novel mechanism
+    for the sudden onset of chaos in dry friction oscillators, Int. J. Bifurcation Chaos 13 (2003)
+    2935-2948, with a0 = a1 = 1.5 and a3 = 0.45.
+
+    Args:
+        a0: Static coefficient >= 0, a dimensionless scalar.
+        a1: Initial slope, likewise.
+        a3: Cubic coefficient, likewise.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
 
     a0: Float[Array, ""] = eqx.field(converter=_scalar("a0"))
@@ -373,7 +414,7 @@ class Cubic(AbstractFriction):
     def __check_init__(self):
         self.check("Cubic")
 
-    # The law's own: a copy would be a parameter of its own.
+    # The law's own value: a copy would be a further parameter.
     @property
     def static(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.a0
@@ -394,8 +435,8 @@ def _of_static_and_kinetic(static: ArrayLike, kinetic: ArrayLike) -> list[Rule]:
     return [*rules, Rule("kinetic", (kinetic, static), operator.le, "<= static = {1}")]
 
 
-#: By how much of the largest coefficient the curve of a table may leave what its points span. Of
-#: laws that fall and level out 0.028 was the most seen, and a picture hardly shows that.
+#: How far the curve of a table may leave the range of its points, over the largest coefficient. For
+#: laws that fall and level out at most 0.028 was seen, which hardly shows in a picture.
 MOST_ASTRAY = 0.03
 
 
@@ -403,17 +444,23 @@ class Tabulated(AbstractFriction):
     """A law from a table of measured coefficients: a smooth curve through all of its points.
 
     mu(r) = level + sum of w_i sqrt((r - r_i)^2 + h_i^2) over the points (r_i, mu_i), Hardy's
-    multiquadrics: h_i is the way from r_i to the nearer of its neighbours, and the w_i, whose sum
-    is zero, are such that mu(r_i) = mu_i. It has all derivatives, keeps close to straight lines
-    between the points, and levels out beyond the last one; a warning says where it does not. What
-    is faster rests on that: in a stick-slip cycle speeds reach about twice the belt's velocity.
+    multiquadrics: h_i is the distance of r_i from the nearer of its neighbours, and the w_i, whose
+    sum is zero, are such that mu(r_i) = mu_i. The curve has all derivatives, keeps close to
+    straight lines between the points, and levels out beyond the last one; a warning says where it
+    does not. Motions that slip faster than the last point depend on that: in a stick-slip cycle
+    speeds reach about twice the belt's velocity. The curve follows scatter in the table, too:
+    smooth it before. See R. L. Hardy, Multiquadric equations of topography and other irregular
+    surfaces, J. Geophys. Res. 76 (1971) 1905-1915.
 
-    Arguments: speeds (increasing, >= 0, two or more) and coefficients (>= 0, as many), known
-    numbers, which are no parameters, so that another table compiles anew; static, a scalar (None:
-    mu(0), what the curve has there). `ValueError` for anything else, and where static is less than
-    mu(0). What scatters in the table is followed, too: smooth it before. See R. L. Hardy,
-    Multiquadric equations of topography and other irregular surfaces, J. Geophys. Res. 76 (1971)
-    1905-1915.
+    The numbers of the table are known and no parameters, so that another table compiles anew.
+
+    Args:
+        speeds: Speeds r_i, increasing, >= 0, two or more.
+        coefficients: Coefficients mu_i >= 0, as many.
+        static: Static coefficient, a scalar; None: mu(0) of the curve.
+
+    Raises:
+        ValueError: If an argument is impossible, or static is less than mu(0).
     """
 
     static: Float[Array, ""]
@@ -446,9 +493,10 @@ class Tabulated(AbstractFriction):
         self._warn_if_astray()
 
     def _warn_if_astray(self) -> None:
-        """Warn where the curve leaves what its points span: where gaps of the table differ much."""
+        """Warns if the curve leaves the range of its points, as where gaps of the table differ
+        much."""
         speeds, mus = np.array(self.speeds), np.array(self.coefficients)
-        # Beyond the last point it may go on as far as over the last gap, but does not push.
+        # Beyond the last point it may go on as far as over the last gap, but must not push.
         beyond = max(0.0, 2.0 * mus[-1] - mus[-2])
         ends, steps = np.append(speeds, 3.0 * speeds[-1]), np.append(mus, beyond)
         at = np.concatenate([np.linspace(*gap, 65) for gap in itertools.pairwise(ends)])
@@ -489,7 +537,7 @@ class Tabulated(AbstractFriction):
         return _of_static(np.asarray(self.static) if known else self.static, self._begins)
 
     def __repr__(self) -> str:
-        # All of it: stores are known by this text.
+        # All of it, because stores are identified by this text.
         columns = (", ".join(map("{:.12g}".format, c)) for c in (self.speeds, self.coefficients))
         return "Tabulated([{}], [{}], static={})".format(*columns, number(self.static))
 
@@ -509,7 +557,7 @@ def _table(speeds: Any, coefficients: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _multiquadrics(numpy: Any, at: Any, speeds: np.ndarray) -> Any:
-    """sqrt((at - r_i)^2 + h_i^2) for every point of a table, along a last axis of its own."""
+    """sqrt((at - r_i)^2 + h_i^2) for every point of a table, along a further last axis."""
     gaps = np.pad(np.diff(speeds), 1, constant_values=np.inf)
     widths = np.minimum(gaps[:-1], gaps[1:])
     shape = (1,) * numpy.ndim(at) + (-1,)

@@ -49,7 +49,7 @@ from .transitions import codes_past_edge
 TimedState = tuple[Array, Array, Array]
 #: A guard is zero up to rounding below this, times the size of what it is made of; velocities are
 #: equal at an instant up to this fraction.
-ROUNDING, SAME = 1e-14, 2e-15
+GUARD_ROUNDING, EQUAL_VELOCITY = 1e-14, 2e-15
 #: Slopes and curvatures of a limit below these are zero; then the limit is asked a little later.
 LEAST_SLOPE, LEAST_CURVATURE, LATER = 1e-12, 1e-10, 1e-3
 #: Speed at an edge below which loops around a point on it are rounding of x1.
@@ -101,7 +101,7 @@ def _limits(now: Oscillator, mode: Mode, x1: Array, x2: Array) -> list[Array]:
     return [jnp.where(stuck, limit + way * needed, jnp.inf) for way in (-1.0, 1.0)]
 
 
-class Course(NamedTuple):
+class Trend(NamedTuple):
     """Values of guards, and their first two derivatives by the time along the motion."""
 
     value: Array
@@ -109,16 +109,16 @@ class Course(NamedTuple):
     curvature: Array
 
 
-def course(
+def trend_of(
     osc: Oscillator, mode: Mode, guards: Callable[[TimedState], Array], y: TimedState
-) -> Course:
+) -> Trend:
     """Guards at a state and how they change in the motion of the mode."""
 
     def rate(*y):
         return jax.jvp(lambda *y: guards(y), y, field_at(osc, mode, y))
 
     (value, slope), (_, curvature) = jax.jvp(rate, y, field_at(osc, mode, y))
-    return Course(value, slope, curvature)
+    return Trend(value, slope, curvature)
 
 
 def guard_sizes(osc: Oscillator, y: TimedState) -> Array:
@@ -138,13 +138,13 @@ def are_mates(osc: Oscillator, i: int, k: int) -> Array:
     """Whether two belts have the same velocity at all times."""
     if i == k:
         return jnp.asarray(True)
-    one, other = (_numbers(osc.belts[j].velocity) for j in (i, k))
+    one, other = (_wave_numbers(osc.belts[j].velocity) for j in (i, k))
     constant = (one[1] == 0) & (other[1] == 0)
     alike = functools.reduce(jnp.logical_and, [a == b for a, b in zip(one[1:], other[1:])])
     return (one[0] == other[0]) & (constant | alike)
 
 
-def _numbers(velocity) -> tuple[Array, ...]:
+def _wave_numbers(velocity) -> tuple[Array, ...]:
     if isinstance(velocity, Oscillating):
         return velocity.mean, velocity.amplitude, velocity.frequency, velocity.phase
     return (velocity, *[jnp.zeros(())] * 3)
@@ -153,7 +153,7 @@ def _numbers(velocity) -> tuple[Array, ...]:
 def _is_faster(osc: Oscillator, i: int, k: int, t: Array) -> Array:
     """1 where belt i is faster than belt k just after they had the same velocity, else -1."""
     one, other = osc.belts[i].velocity, osc.belts[k].velocity
-    size = 1e-13 * (1 + sum(abs(x) for v in (one, other) for x in _numbers(v)[:2]))
+    size = 1e-13 * (1 + sum(abs(x) for v in (one, other) for x in _wave_numbers(v)[:2]))
     sign = jnp.ones(())
     for order in (3, 2, 1):
         rates = [
@@ -175,10 +175,10 @@ def _holds(osc: Oscillator, mode: Mode, y: TimedState) -> Array:
     def limits(y):
         return jnp.stack(_limits(at_time(osc, y[2]), mode, *y[:2]))
 
-    value, slope, curvature = course(osc, mode, limits, y)
+    value, slope, curvature = trend_of(osc, mode, limits, y)
     later = limits(carried(osc, mode, y, jnp.asarray(LATER)))
     limit = capacity(now, mode)
-    rounding = ROUNDING * blur(y[2]) * (1 + jnp.abs(y[0]) + limit)
+    rounding = GUARD_ROUNDING * blur(y[2]) * (1 + jnp.abs(y[0]) + limit)
     bends = jnp.where(jnp.abs(curvature) > LEAST_CURVATURE, curvature > 0, later >= value - 1e-13)
     goes_in = jnp.where(jnp.abs(slope) > LEAST_SLOPE, slope > 0, bends)
     held = jnp.where(jnp.abs(value) <= rounding, goes_in, value > 0)
@@ -250,23 +250,20 @@ def at_zero(osc: Oscillator, mode: Mode, y: TimedState, k: Array) -> list[Array]
     found = []
     for i, (belt, touches) in enumerate(zip(now.belts, mode.touching, strict=True)):
         mate = any_of([(k == j) & are_mates(osc, i, j) for j in range(n)])
-        size = jnp.abs(belt.velocity) + jnp.abs(velocity) + jnp.abs(_numbers_of(osc, i)[1])
-        near = jnp.abs(belt.velocity - velocity) <= SAME * blur(t) * size
+        amplitude = _wave_numbers(osc.belts[i].velocity)[1]
+        size = jnp.abs(belt.velocity) + jnp.abs(velocity) + jnp.abs(amplitude)
+        near = jnp.abs(belt.velocity - velocity) <= EQUAL_VELOCITY * blur(t) * size
         found.append(touches & (mate | near))
     return found
-
-
-def _numbers_of(osc: Oscillator, i: int) -> tuple[Array, ...]:
-    return _numbers(osc.belts[i].velocity)
 
 
 # --- starts ---------------------------------------------------------------------------------------
 
 
-def begun(osc: Oscillator, y: TimedState) -> tuple[Mode, Array]:
+def begun_at(osc: Oscillator, y: TimedState) -> tuple[Mode, Array]:
     """The mode of a start, and whether it is a pseudo-focus: at rest on an edge to which it is
     pushed from both sides."""
-    sides = [_side(osc, y, rightward) for rightward in (False, True)]
+    sides = [_start_on_side(osc, y, rightward) for rightward in (False, True)]
     (left, a_left), (right, a_right) = sides
     if not has_edges(osc):
         return right, jnp.asarray(False)
@@ -281,7 +278,7 @@ def begun(osc: Oscillator, y: TimedState) -> tuple[Mode, Array]:
     return select(to_right, right, left), focus
 
 
-def _side(osc: Oscillator, y: TimedState, rightward: bool) -> tuple[Mode, Array]:
+def _start_on_side(osc: Oscillator, y: TimedState, rightward: bool) -> tuple[Mode, Array]:
     x1, x2, t = y
     now = at_time(osc, t)
     codes = []
@@ -396,4 +393,4 @@ def is_held_for_ever(osc: Oscillator, mode: Mode, y: TimedState) -> Array:
     rest = mode_acceleration(now, mode, y[0], y[1]) - functools.reduce(jnp.add, pushes)
     bounds = [force.bound(osc.damping) for force in osc.forcing]
     largest = jnp.abs(rest) + functools.reduce(jnp.add, bounds, jnp.zeros(()))
-    return still & (largest <= limit * (1 + ROUNDING)) & (limit > 0)
+    return still & (largest <= limit * (1 + GUARD_ROUNDING)) & (limit > 0)

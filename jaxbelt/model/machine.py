@@ -4,8 +4,8 @@
     R_i = V_i - X'
 
 One unit of time is sqrt(m/k); one of length is the deflection of the spring under the largest
-normal force, max N_i / k; velocity, force and energy follow from these. So the oscillator has
-omega = 1, its largest load is 1, and its laws take speeds in the unit of velocity.
+normal force, max N_i / k; velocity, force and energy follow from these. So the oscillator has omega
+= 1, its largest load is 1, and its laws take speeds in the unit of velocity.
 """
 
 import dataclasses
@@ -44,10 +44,17 @@ from .own_units import in_unit
 
 
 class Units(eqx.Module):
-    """How much one of a dimensionless quantity of a `Machine` is.
+    """Units of the dimensionless quantities of a `Machine`, scalars.
 
-    Scalars: time in s, length in m, velocity in m/s, force in N, energy in J. `ValueError` for one
-    that is not > 0.
+    Args:
+        time: Unit of time in s.
+        length: Unit of length in m.
+        velocity: Unit of velocity in m/s.
+        force: Unit of force in N.
+        energy: Unit of energy in J.
+
+    Raises:
+        ValueError: If a unit is not > 0.
     """
 
     time: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "time"))
@@ -66,7 +73,7 @@ class Units(eqx.Module):
         return f"Units({', '.join(parts)})"
 
 
-#: What the arguments of `PhysicalBelt` and `Machine` are sometimes called.
+#: Other names for the arguments of `PhysicalBelt` and `Machine`.
 OTHER_NAMES = {
     **{"v": "velocity", "speed": "velocity", "law": "friction", "mu": "friction"},
     **dict.fromkeys(("n", "normal", "force", "load"), "normal_force"),
@@ -83,11 +90,17 @@ def _check_fields(of: Any, given: Iterable[str]) -> None:
 class PhysicalBelt(eqx.Module):
     """A belt of a `Machine`, in SI units; it touches the mass while lower < X < upper.
 
-    Arguments, scalars: velocity V in m/s; friction, a law that takes speeds in m/s (`Conti`'s
-    steepness is then in s/m, `Stribeck`'s velocity in m/s); normal_force N >= 0 in newtons (it and
-    the velocity may be `Oscillating`, with an angular frequency in rad/s); lower and upper,
-    displacements in m from where the spring is at rest (default unbounded). `ValueError` names a
-    value that is not possible.
+    Args:
+        velocity: V in m/s, a number or `Oscillating` with an angular frequency in rad/s.
+        friction: A law that takes speeds in m/s (`Conti`'s steepness is then in s/m, `Stribeck`'s
+            velocity in m/s).
+        normal_force: N >= 0 in newtons, likewise a number or `Oscillating`.
+        lower: Lower end of the contact interval, a displacement in m from where the spring is
+            relaxed; default unbounded.
+        upper: Upper end, likewise.
+
+    Raises:
+        ValueError: If a value is impossible; the message names it.
     """
 
     # Scalar arrays, or `Oscillating`.
@@ -132,15 +145,21 @@ class PhysicalBelt(eqx.Module):
 class Machine(eqx.Module):
     """A mass on a spring and a dashpot, in contact with one belt or more, in SI units.
 
-    Arguments: mass m in kg, stiffness k in N/m, damping c in N s/m, belts (one `PhysicalBelt` or
-    more), forcing (a force or a tuple of them, default none: of a `Harmonic` the amplitude is in N
-    and the angular frequency in rad/s, of a `BaseMotion` the amplitude in m; a force of one's own
-    takes s and gives N). `ValueError` names a value that is not possible.
+    `oscillator` is the dimensionless `Oscillator`, which all of this package takes; `units` are its
+    units, and `start(x, v)` and `tau(t)` convert a state and a time. `in_si` and `plot_in_si`
+    convert results back. Everything is differentiable by every number of the machine.
 
-    `oscillator` is the dimensionless `Oscillator`, which all of this package takes; `units` what
-    one of its time, length, velocity, force and energy is; `start(x, v)` and `tau(t)` are what a
-    state and a time are there. `in_si` and `plot_in_si` bring results back. Everything is
-    differentiable by every number of the machine.
+    Args:
+        mass: m in kg.
+        stiffness: k in N/m.
+        damping: c in N s/m.
+        belts: One `PhysicalBelt` or more.
+        forcing: A force or a tuple of forces; default none. A `Harmonic` has its amplitude in N and
+            its angular frequency in rad/s, a `BaseMotion` its amplitude in m; your own force takes
+            s and returns N.
+
+    Raises:
+        ValueError: If a value is impossible; the message names it.
     """
 
     mass: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "mass"))
@@ -167,14 +186,16 @@ class Machine(eqx.Module):
 
     @property
     def units(self) -> Units:
-        largest = jnp.max(jnp.stack([_largest(belt.normal_force) for belt in self.belts]))
-        # Without any force on a belt no length stands out.
+        """One unit of each dimensionless quantity, in SI units."""
+        largest = jnp.max(jnp.stack([_largest_force(belt.normal_force) for belt in self.belts]))
+        # Without any force on a belt there is no natural length.
         length = jnp.where(largest > 0, largest / self.stiffness, 1.0)
         time, force = jnp.sqrt(self.mass / self.stiffness), self.stiffness * length
         return Units(time, length, length / time, force, force * length)
 
     @property
     def oscillator(self) -> Oscillator:
+        """The dimensionless `Oscillator`."""
         units = self.units
         belts = [
             Belt(
@@ -192,20 +213,41 @@ class Machine(eqx.Module):
         return Oscillator(damping, belts, forcing=forcing)
 
     def start(self, displacement: ArrayLike, velocity: ArrayLike) -> tuple[Array, Array]:
-        """The dimensionless state (x1, x2) of a displacement in m and a velocity in m/s."""
+        """The dimensionless start of a motion.
+
+        Args:
+            displacement: In m.
+            velocity: In m/s.
+
+        Returns:
+            The state (x1, x2).
+        """
         x1, x2 = _si_numbers(displacement, "displacement"), _si_numbers(velocity, "velocity")
         units = self.units
         return x1 / units.length, x2 / units.velocity
 
     def tau(self, time: ArrayLike) -> Array:
-        """The dimensionless time of a time in s."""
+        """The dimensionless time tau.
+
+        Args:
+            time: In s, any shape.
+
+        Returns:
+            The time, of the same shape.
+        """
         return _si_numbers(time, "time") / self.units.time
 
     def of_oscillator(self, osc: Oscillator) -> "Machine":
-        """This machine with the numbers of a dimensionless oscillator, such as a fit's.
+        """This machine with the numbers of a dimensionless oscillator, such as that of a fit.
 
-        In the units of this machine, with its mass and stiffness. `ValueError` for another number
-        of belts, and for an omega other than 1.
+        Args:
+            osc: The oscillator, in the units of this machine.
+
+        Returns:
+            A `Machine` with the mass and stiffness of this one.
+
+        Raises:
+            ValueError: If the number of belts differs, or omega is not 1.
         """
         check_oscillator(osc)
         require(len(osc.belts) == len(self.belts), "osc", f"of {len(self.belts)} belts", osc)
@@ -241,7 +283,7 @@ def _forcing_text(forcing: tuple[AbstractForce, ...]) -> str:
     return f", forcing=({', '.join(map(repr, forcing))},)" if forcing else ""
 
 
-def _largest(normal_force: Any) -> Array:
+def _largest_force(normal_force: Any) -> Array:
     if isinstance(normal_force, Oscillating):
         return normal_force.mean + jnp.abs(normal_force.amplitude)
     return normal_force

@@ -249,6 +249,12 @@ def edges(osc: Oscillator) -> list[Array]:
     return [jnp.asarray(float(x)) if isinstance(x, NoEdge) else x for x in bounds]
 
 
+def zone_ends(osc: Oscillator) -> tuple[Array, Array]:
+    """Lower and upper ends of the intervals of x1 between contact edges, from left to right."""
+    positions, end = jnp.sort(jnp.stack(edges(osc))), jnp.full(1, jnp.inf)
+    return jnp.concatenate([-end, positions]), jnp.concatenate([positions, end])
+
+
 def zone(osc: Oscillator, mode: Mode) -> tuple[Array, Array]:
     """The edges between which the contacts of a mode do not change."""
     lower, upper = jnp.asarray(-jnp.inf), jnp.asarray(jnp.inf)

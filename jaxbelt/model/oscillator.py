@@ -17,7 +17,7 @@ velocity or load oscillates, stand in `forcing`. The paper's symbols, and ours:
 | sigma0, sigma1 | `Belt.lower`, `Belt.upper` | interval of x1 in which a belt touches |
 | mus, p1, p2, p3 | `Conti.static, residual, quadratic, steepness` | eqs. (7), (16) |
 
-What happens where the field is not smooth is told in `modes`.
+What happens where the field is not smooth is defined in `modes`.
 
 An oscillator that knows the time, see `has_clock`, has no field of (x1, x2) alone. At an instant it
 is one without a clock, with a constant force and belts of constant velocity and load: `at_time`
@@ -68,7 +68,7 @@ def _(primals, tangents):
 def as_edge(value: Any, field: str) -> Array:
     """`value` as the edge of a contact interval, or a `ValueError`.
 
-    An edge at infinity has no part in the motion, and so no slope: that of inf/L is infinite.
+    An edge at infinity has no effect on the motion, and so no slope: that of inf/L is infinite.
     """
     edge = as_array(value, field)
     if not isinstance(edge, Tracer):
@@ -82,15 +82,18 @@ def as_edge(value: Any, field: str) -> Array:
 
 
 class NoEdge(float):
-    """An edge at infinity that is part of the structure of an oscillator: a number everywhere, but
-    no leaf, so that it is known in every trace, and what edges need is left out there."""
+    """An edge at infinity that is part of the structure of an oscillator.
+
+    It works as a number everywhere, but is no leaf: so it is known in every trace, and code for
+    edges is left out there.
+    """
 
 
 jax.tree_util.register_pytree_node(NoEdge, lambda edge: ((), float(edge)), lambda at, _: NoEdge(at))
 
 
 def scaled_edge(edge: Any, factor: ArrayLike) -> Any:
-    """An edge in another unit, without a slope where it is at infinity, in reverse mode neither."""
+    """An edge in another unit, without a slope where it is at infinity, also in reverse mode."""
     if is_concrete(edge):
         return edge if np.isinf(edge) else edge * factor
     is_edge = jnp.isfinite(edge)
@@ -98,13 +101,22 @@ def scaled_edge(edge: Any, factor: ArrayLike) -> Any:
 
 
 class Belt(eqx.Module):
-    """A rough belt that touches the mass while lower < x1 < upper.
+    """A rough belt that moves at a given velocity and touches the mass while lower < x1 < upper.
 
-    Arguments, dimensionless scalars: velocity (nu), friction (a law), load (u0 = Fn/k >= 0,
-    default 1), lower and upper (edges of the contact interval, default unbounded; one at infinity
-    has no derivative. Write it `jnp.inf`: of `jnp.inf / L` the reverse derivative by L is NaN under
-    `jit`, in JAX). Velocity and load may be `Oscillating`. `ValueError` for non-finite, negative or
-    wrongly shaped values or an interval turned round.
+    All numbers are dimensionless scalars.
+
+    Args:
+        velocity: nu, a number or `Oscillating`.
+        friction: Friction law.
+        load: Normal force over stiffness, u0 = Fn/k >= 0, a number or `Oscillating`; default 1.
+        lower: Lower edge of the contact interval; default unbounded. An edge at infinity has no
+            derivative. Write it `jnp.inf`: the reverse derivative of `jnp.inf / L` by L is NaN
+            under `jit`, in JAX.
+        upper: Upper edge, likewise.
+
+    Raises:
+        ValueError: If a value is not finite, negative or of the wrong shape, or if the interval is
+            reversed.
     """
 
     # A scalar array, or `Oscillating`.
@@ -122,12 +134,12 @@ class Belt(eqx.Module):
         self.check("belt")
 
     def check(self, owner: str) -> None:
-        """Raise a `ValueError` naming `owner` where a known parameter is out of range."""
+        """Raises a `ValueError` naming `owner` if a known parameter is out of range."""
         for rule in self.rules():
             rule.enforce(f" of {owner}")
 
     def rules(self) -> list[Rule]:
-        """What its parameters have to be, those of its law included."""
+        """Conditions on its parameters, those of its law included."""
         law = type(self.friction).rules(self.friction)
         interval = [
             Rule("lower", (self.lower, self.lower), operator.eq, "a number"),
@@ -165,7 +177,7 @@ class MovingBelt(Belt):
 
 
 def as_belts(belts: Any, kind: str = "Belt") -> tuple:
-    """The belts as a tuple; kind: what each of them is called."""
+    """The belts as a tuple; kind: name of their class, for messages."""
     expected = f"a tuple of belts, such as (jb.{kind}(...), jb.{kind}(...))"
     fits = isinstance(belts, Iterable) and not isinstance(belts, str | dict)
     require_value(fits, "belts", expected, belts)
@@ -179,11 +191,17 @@ def _in_numpy(leaf: Any) -> Any:
 class Oscillator(eqx.Module):
     """A mass on a spring and a dashpot, in contact with one belt or more.
 
-    Arguments: damping (zeta = c/sqrt(k m)), belts (one `Belt` or more), omega (sqrt(k/m) > 0,
-    default 1); scalars, dimensionless; forcing (a force on the mass such as `Harmonic`, or a tuple
-    of them; default none). `ValueError` for anything else. For batches build it
-    inside `jax.vmap`. A negative damping is possible; starts far out may then go to infinity,
-    which `portrait(osc).escapes` tells.
+    For batches build it inside `jax.vmap`. A negative damping is possible; starts far out may then
+    go to infinity, see `portrait(osc).escapes`. All numbers are dimensionless scalars.
+
+    Args:
+        damping: zeta = c/sqrt(k m).
+        belts: One `Belt` or more.
+        omega: sqrt(k/m) > 0, default 1: the unit of time of the belts' velocities.
+        forcing: A force on the mass such as `Harmonic`, or a tuple of forces; default none.
+
+    Raises:
+        ValueError: If a value is impossible; the message names it.
     """
 
     damping: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "damping"))
@@ -197,10 +215,10 @@ class Oscillator(eqx.Module):
         self.check()
 
     def check(self) -> None:
-        """Raise a `ValueError` that names the first field with an impossible known value."""
-        # As NumPy's, when they are known: a look at an array of JAX's costs a hundred times more.
-        # And checks are taken from their class: Equinox makes a module of a method of an object.
-        # A law of one's own may have Python's numbers as well.
+        """Raises a `ValueError` that names the first field with an impossible known value."""
+        # Known values are converted to NumPy: reading an array of JAX's costs a hundred times more.
+        # Checks are taken from their class, as Equinox makes a module of a method of an object. A
+        # user's law may have Python's numbers, too.
         osc = jax.tree.map(_in_numpy, self) if is_concrete(self) else self
         for rule in Oscillator.rules(osc):
             rule.enforce("")
@@ -216,7 +234,7 @@ class Oscillator(eqx.Module):
             AbstractForce.check(force, f"forcing[{i}]")
 
     def rules(self) -> list[Rule]:
-        """What its parameters have to be, but for those of its belts."""
+        """Conditions on its parameters, without those of its belts."""
         return be_finite("damping", self.damping) + be_positive("omega", self.omega)
 
     def __repr__(self) -> str:
@@ -228,14 +246,14 @@ class Oscillator(eqx.Module):
 
 
 def has_clock(osc: Oscillator) -> bool:
-    """Whether the oscillator knows the time; told by its structure, in a trace, too."""
+    """Whether the oscillator knows the time; decided by its structure, so known in a trace, too."""
     forced = any(not isinstance(force, ConstantForce) for force in osc.forcing)
     waves = [wave for belt in osc.belts for wave in (belt.velocity, belt.load)]
     return forced or any(isinstance(wave, Oscillating) for wave in waves)
 
 
 def refuse_clock(osc: Any, name: str, instead: str = "") -> None:
-    """Raise where an oscillator knows the time and `name` is for those that do not.
+    """Raises if an oscillator knows the time and `name` is for those that do not.
 
     instead: what else to use, such as "jb.sweep(...)".
     """
@@ -256,20 +274,20 @@ def check_clock(osc: Any, name: str, instead: str) -> None:
 
 
 def frequencies(osc: Oscillator) -> list[Array]:
-    """The angular frequencies of all that knows the time: forces, then velocities and loads."""
+    """Angular frequencies of all that knows the time: forces, then velocities and loads."""
     forces = [one.frequency for one in osc.forcing if not isinstance(one, ConstantForce)]
     waves = [wave for belt in osc.belts for wave in (belt.velocity, belt.load)]
     return forces + [wave.frequency for wave in waves if isinstance(wave, Oscillating)]
 
 
 def fastest(osc: Oscillator) -> Array:
-    """The highest frequency of what knows the time, 1, the natural frequency, at least."""
+    """The highest frequency of all that knows the time, at least 1, the natural frequency."""
     forces = [one.fastest for one in osc.forcing if not isinstance(one, ConstantForce)]
     waves = frequencies(osc)[len(forces) :]
     return functools.reduce(jnp.maximum, map(jnp.abs, forces + waves), jnp.ones(()))
 
 
-def value_at(wave: Any, t: Array) -> Any:
+def wave_at(wave: Any, t: Array) -> Any:
     """A velocity or a load at the time t."""
     return wave.value(t) if isinstance(wave, Oscillating) else wave
 
@@ -298,8 +316,8 @@ def _belt_at(belt: Belt, t: Array) -> Belt:
     moves = isinstance(belt.velocity, Oscillating)
     made = object.__new__(MovingBelt if moves else Belt)
     fields = vars(belt) | {
-        "velocity": value_at(belt.velocity, t),
-        "load": value_at(belt.load, t),
+        "velocity": wave_at(belt.velocity, t),
+        "load": wave_at(belt.load, t),
     }
     if moves:
         fields["rate"] = belt.velocity.rate(t)

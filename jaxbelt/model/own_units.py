@@ -66,7 +66,7 @@ def own_length(osc: Oscillator) -> Any:
 
     The size is the largest friction force over the stiffness, u0 mu(0): the mass sticks within
     that distance of the origin. A heavy belt whose contact ends earlier moves the mass no farther
-    than to the edge; there edges and velocities tell the size, and so they do without friction.
+    than to the edge; there edges and velocities determine the size, also without friction.
     """
 
     def number(leaf: Any) -> Any:

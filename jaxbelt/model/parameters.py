@@ -1,9 +1,9 @@
-"""Which parameter is meant: a leaf of the oscillator, known by its place.
+"""Parameters of an oscillator: leaves, identified by their places.
 
-Two parameters may have one value, and two belts may share one friction law; what tells parameters
-apart is their place among the leaves of the oscillator, as JAX counts them. So `where` is asked on
-a copy of the oscillator whose leaves are nothing but themselves: whatever comes back is one of
-them, or it is not a parameter.
+Two parameters may have one value, and two belts may share one friction law; parameters
+differ in their place among the leaves of the oscillator, as JAX counts them. So `where` is called
+on a copy of the oscillator whose leaves are unique objects: its result is one of them, or it is not
+a parameter.
 """
 
 from typing import Any, NoReturn

@@ -169,7 +169,7 @@ def stick_phase(osc: Oscillator, mode: Mode, x1: Array) -> StickPhase:
     """How the stick phase of `mode` that is at x1 goes on: x1 moves with x2 = nu_k/omega.
 
     It ends at slip onset or at the first contact edge ahead. Where both are at one place but for
-    rounding it ends at the edge, and `pass_edge` tells whether the mass sticks beyond.
+    rounding it ends at the edge, and `pass_edge` decides whether the mass sticks beyond.
     """
     v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
     moves = v != 0

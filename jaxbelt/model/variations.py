@@ -6,7 +6,7 @@ who uses it does not know from which. Compiled programs are handed a `Family`: o
 linear in the parameters, their leaves and slopes as data, so that one program serves every
 parameter and every function. Where a function is not linear, what was solved for in the family that
 is tangent to it at a guess is solved for again in the one that is tangent at the solution, until
-both are one oscillator there (`Variation.settle`). That is Newton's method once more.
+both are one oscillator there (`Variation.relinearised`). That is Newton's method once more.
 """
 
 import functools
@@ -33,6 +33,7 @@ from .oscillator import (
     has_edges,
     interval_ends,
     its_oscillator,
+    refuse_clock,
 )
 from .own_units import OwnOscillator, in_own_units, own_length, power_of_two_below
 from .parameters import is_number, is_real, leaf_index, names_of
@@ -52,6 +53,10 @@ VALUES_SEEN, MERGED = 257, 1e-7
 OFTEN = 64
 #: Guesses along each side of a plane for where an oscillator lies in it.
 GUESSES = 9
+
+
+#: What varies a parameter of an oscillator without a clock.
+VARIED = "this diagram, scan or set of fractions"
 
 
 class Family(eqx.Module):
@@ -166,6 +171,7 @@ class Variation:
             told = f"one that returns {kind}{its_oscillator(osc, 'return')}"
             require(isinstance(osc, Oscillator), argument, expected, told)
             check_scalars(osc)
+            refuse_clock(osc, VARIED, "jb.simulate")
             leaves = jax.tree.leaves(osc)
             return [jnp.asarray(leaf) for leaf in leaves if is_real(leaf)]
 
@@ -455,7 +461,7 @@ class Variation:
                 break
         return value
 
-    def settle(
+    def relinearised(
         self, attempt: Callable[[Family, Any], tuple[Any, Any]], unknowns: Any
     ) -> tuple[Any, Any]:
         """What an attempt finds in the family that is tangent where it ends, and whether it is.
@@ -562,6 +568,7 @@ def varied(osc: Any, where: Any, values: Sequence[Any]) -> Variation:
         make: Any = osc
         return Variation.of_function(make, values)
     check_oscillator(osc)
+    refuse_clock(osc, VARIED, "jb.simulate")
     return Variation.of_leaves(osc, [leaf_index(osc, where)])
 
 

@@ -4,7 +4,7 @@ In a slip arc the orbit runs in the smooth field of its mode until one of these 
 
 - a guard of the mode, that is, a boundary r_k = 0 or a contact edge (see `modes`);
 - x2' or x2. Between two such extrema x2 (x1) is monotone, so each boundary (edge) is met once at
-  most: the sign of a guard after a step tells whether it was met, and its sign at the extremum
+  most: the sign of a guard after a step shows whether it was met, and its sign at the extremum
   itself whether an orbit that grazes a boundary meets it.
 
 An integrator marches until a step ends outside; that step is then made once more, shorter, so that

@@ -1,12 +1,11 @@
 """Many runs of `simulate` at once, through the lanes of `kernel`.
 
-Runs are done in groups, side by side. A round of a group is some steps of all its lanes, and what
-happens to them on the way is written down, round after round. The arcs of a run, their events and
-its samples are then looked up in these books. A loop that a run repeats is followed once, see
-`kernel.marks`.
+Runs are done in groups, side by side. A round of a group is some steps of all its lanes; their
+events are recorded, round after round. The arcs of a run, their events and its samples are then
+taken from these records. A loop that a run repeats is followed once, see `kernel.marks`.
 
-Few runs end in a way that the lanes do not tell to the last, at rest on a guard, say. These are
-followed again, each by itself.
+The kernel cannot finish a few runs, such as those at rest on a guard; they are run again one by
+one.
 """
 
 import functools

@@ -32,12 +32,13 @@ from jaxtyping import Array
 
 from ..kernel.marks import LoopSearch
 from ..model.events import event_between
-from ..model.instants import begun
+from ..model.instants import begun_at
 from ..model.modes import Mode, mode_acceleration, select
 from ..model.oscillator import Oscillator, has_clock, has_possible_numbers
 from ..model.rest import is_at_rest
 from ..model.transitions import at_focus, mode_of_state
 from ..numerics.compiling import any_lane, more_rows, of_lane, one_kernel, with_batches
+from ..numerics.padding import in_groups_of
 from ..results import Status
 from .arcs import ArcEnd, Signs, SlipArc, after_slip, signs_after, slip_arc, stick_arc
 from .batches import BOOK, LANES_AT_ONCE, PAGE, Batch, Group, blank_book, followed_together
@@ -47,8 +48,8 @@ from .sampling import arcs_at, sampled
 from .sensitivities import (
     Arc,
     Sensitivity,
-    columns_of,
     in_one_row,
+    parts_of_states,
     sensitivities,
     split,
     with_derivatives,
@@ -150,7 +151,7 @@ def _segment(osc: Oscillator, state: RunState, t1, rtol, atol) -> tuple[RunState
 
 
 @one_kernel
-def _timed_arc(osc, mode, y, until, rtol, atol) -> TimedArc:
+def _timed_in_one_piece(osc, mode, y, until, rtol, atol) -> TimedArc:
     return timed_arc(osc, mode, y, until, rtol, atol)
 
 
@@ -158,7 +159,7 @@ def _timed_segment(osc: Oscillator, state: RunState, t1, rtol, atol):
     """`_segment` with a clock."""
     x1, x2, t = state.y
     until = jnp.where(state.done, state.t, t1)
-    arc = _timed_arc(osc, state.mode, (x1, x2, t), until, SAFETY * rtol, SAFETY * atol)
+    arc = _timed_in_one_piece(osc, state.mode, (x1, x2, t), until, SAFETY * rtol, SAFETY * atol)
     return _after_arc(state, arc.end, arc.done, t1)
 
 
@@ -210,7 +211,7 @@ def _followed_arcs(
     ones = jnp.ones_like(y0[0])
     if has_clock(osc):
         y = (*y, t0)
-        mode, rests = begun(osc, (y0[0], y0[1], t0))
+        mode, rests = begun_at(osc, (y0[0], y0[1], t0))
     else:
         mode, rests = mode_of_state(osc, *y), at_focus(osc, *y)
     finite = jnp.all(jnp.isfinite(y0)) & has_possible_numbers(osc)
@@ -315,8 +316,7 @@ def _followed_rows(lane, axis_size: int, batched, args, rules: Rules):
 
     def by_group(leaf):
         # Lanes that are left over do nothing: they start nowhere.
-        padding = jnp.full((groups * width - axis_size, *leaf.shape[1:]), jnp.nan, leaf.dtype)
-        return jnp.concatenate([leaf, padding]).reshape(groups, width, *leaf.shape[1:])
+        return in_groups_of(width, leaf, fill=jnp.nan)
 
     def spread(leaf, flag):
         return leaf if flag else jnp.broadcast_to(leaf, (axis_size, *jnp.shape(leaf)))
@@ -415,8 +415,8 @@ def _(primals, tangents):
     behind = jnp.arange(1, used.size + 1)
     again = jnp.where(behind == loop.last, loop.loops, 0)
     arcs = Arc(
-        entry=columns_of(records.y),
-        end=columns_of(records.event_y),
+        entry=parts_of_states(records.y),
+        end=parts_of_states(records.event_y),
         codes=records.mode,
         duration=records.duration,
         ended_by=records.ended_by,

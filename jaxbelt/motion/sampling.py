@@ -12,6 +12,7 @@ from ..model.instants import carried
 from ..model.modes import Mode, select, stick_velocity
 from ..model.oscillator import Oscillator, has_clock
 from ..numerics.compiling import one_kernel
+from ..numerics.padding import longer
 from .integrators import Adaptive, slip_field
 
 #: Lanes in which samples are computed.
@@ -40,7 +41,7 @@ def sampled(osc: Oscillator, records, ts: Array, rtol, atol) -> Array:
     wanted = ts.size
     if not wanted:
         return jnp.zeros((0, 2))
-    ts = jnp.pad(ts, (0, -wanted % SAMPLED), mode="edge")
+    ts = longer(ts, -(-wanted // SAMPLED) * SAMPLED)
     arcs, numbers, since = arcs_at(records, ts)
     since = jnp.minimum(since, arcs.duration)
     stuck = jnp.any(arcs.mode == 0, axis=1)

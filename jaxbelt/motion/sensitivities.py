@@ -33,6 +33,7 @@ from ..model.oscillator import Oscillator, has_clock
 from ..model.rest import is_slow
 from ..model.transitions import on_guard
 from ..numerics.compiling import LARGEST, any_lane, axes_of, one_kernel
+from ..numerics.padding import in_groups_of, longer
 from .arcs import stick_arc
 from .flights import (
     MOST_FLIGHTS,
@@ -62,7 +63,7 @@ class Sensitivity(eqx.Module):
         return jax.tree.map(lambda slopes: slopes @ inputs, self)
 
 
-def _carried(osc: Oscillator, arc: Arc, end: State, y: State, since: Array) -> State:
+def _state_since(osc: Oscillator, arc: Arc, end: State, y: State, since: Array) -> State:
     """The state a time after the entry y, in the mode of an arc, near its end.
 
     end: as `_flown_again` gives it.
@@ -111,7 +112,7 @@ def _passed(osc: Oscillator, arc: Arc, end: State, y: State, remaining: Array) -
 
 
 def _timed_end(osc: Oscillator, arc: Arc, end: State, y: State) -> TimedState:
-    """With a clock: the end of an arc, stuck or not, see `_carried`."""
+    """With a clock: the end of an arc, stuck or not, see `_state_since`."""
     x1, x2, t = select(arc.mode.any_stuck, carried(osc, arc.mode, _timed(y), arc.duration), end)
     return x1, x2, t
 
@@ -134,16 +135,17 @@ def _passed_in_time(
     """`_passed` with a clock: of a stick phase, too, the guard that ended it tells its duration."""
     mode = arc.mode
     found = _timed_end(osc, arc, end, y)
-    known = [_with_numbers_of(a, b) for a, b in zip(_timed(arc.end), found, strict=True)]
+    x1, x2, t = (_with_numbers_of(a, b) for a, b in zip(_timed(arc.end), found, strict=True))
+    known = x1, x2, t
 
-    def fired_guard(*y):
-        guards = guards_at(osc, mode, _timed(y))
+    def fired_guard(x1, x2, t):
+        guards = guards_at(osc, mode, (x1, x2, t))
         return jnp.sum(jnp.where(jnp.arange(guards.size) == arc.ended_by, guards, 0.0))
 
-    guard, slope = jax.jvp(fired_guard, known, [*field_at(osc, mode, _timed(known))])
+    guard, slope = jax.jvp(fired_guard, known, field_at(osc, mode, known))
     late = (lax.stop_gradient(guard) - guard) / jnp.where(slope == 0, 1.0, slope)
     late = jnp.where(arc.in_time, remaining - arc.duration, late)
-    x1, x2, _ = on_guard_at(osc, mode, arc.ended_by, _later(osc, arc, _timed(known), late))
+    x1, x2, _ = on_guard_at(osc, mode, arc.ended_by, _later(osc, arc, known, late))
     return x1, jnp.where(arc.captured, 0.0, x2), arc.duration + late
 
 
@@ -167,7 +169,7 @@ def split(osc: Oscillator, slopes) -> tuple[Oscillator, Oscillator]:
     return eqx.partition(osc, moves)
 
 
-def columns_of(states: Array) -> State:
+def parts_of_states(states: Array) -> State:
     """The parts of states, [rows, parts]."""
     return tuple(states[:, i] for i in range(states.shape[1]))
 
@@ -201,16 +203,10 @@ def _sensitivities(by_run, varied, rest, arcs: Arc, remaining: Array) -> Sensiti
     width = min(largest_power(2 * runs - 1), fitting, RUNS.here)
     depth = min(ROWS, max(1, MOST_FLIGHTS.here // width))
     blocks, chunks = -(-runs // width), -(-rows // depth)
-    padding = (0, blocks * width - runs), (0, chunks * depth - rows)
-
-    def padded(leaf):
-        return jnp.pad(leaf, (*padding, *[(0, 0)] * (leaf.ndim - 2)))
-
-    arcs, remaining = jax.tree.map(padded, (arcs, remaining))
+    more_rows = longer((arcs, remaining), chunks * depth, axis=1, fill=0)
+    arcs, remaining = longer(more_rows, blocks * width, fill=0)
     own, shared = eqx.partition((varied, rest), by_run)
-    own = jax.tree.map(
-        lambda leaf: jnp.pad(leaf, (padding[0], *[(0, 0)] * (leaf.ndim - 1)), "edge"), own
-    )
+    own = longer(own, blocks * width)
     first = Sensitivity(*jnp.broadcast_to(jnp.eye(inputs)[:3, None], (3, width, inputs)))
 
     def block(_, number):
@@ -392,9 +388,7 @@ def _slopes_of_samples(by_run, varied, rest, starts: Array, since: Array, codes:
     size = min(MOST_FLIGHTS.here, largest_power(2 * total - 1))
 
     def chunks(leaf):
-        leaf = leaf.reshape(total, *leaf.shape[2:])
-        padding = (0, -total % size), *[(0, 0)] * (leaf.ndim - 1)
-        return jnp.pad(leaf, padding, "edge").reshape(-1, size, *leaf.shape[1:])
+        return in_groups_of(size, leaf.reshape(total, *leaf.shape[2:]))
 
     run = jnp.broadcast_to(jnp.arange(runs)[:, None], since.shape)
 
@@ -403,8 +397,8 @@ def _slopes_of_samples(by_run, varied, rest, starts: Array, since: Array, codes:
         known = ~jnp.isnan(since)
         never = jnp.zeros_like(known)
         arcs = Arc(
-            entry=columns_of(starts),
-            end=columns_of(ends),
+            entry=parts_of_states(starts),
+            end=parts_of_states(ends),
             codes=codes,
             duration=since,
             ended_by=jnp.full(since.shape, -1),
@@ -415,7 +409,7 @@ def _slopes_of_samples(by_run, varied, rest, starts: Array, since: Array, codes:
             again=jnp.zeros(since.shape, int),
         )
 
-        slopes = slopes_of(_carried, by_run, varied, rest, run, arcs, since, known)
+        slopes = slopes_of(_state_since, by_run, varied, rest, run, arcs, since, known)
         return jnp.where(known[:, None, None], jnp.stack(slopes, axis=1), 0.0)
 
     slopes = lax.map(of_chunk, tuple(map(chunks, (run, starts, since, codes, ends))))

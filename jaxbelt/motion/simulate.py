@@ -53,9 +53,12 @@ if TYPE_CHECKING:
 class Events(eqx.Module):
     """The events of a trajectory in order; under a transformation padded to a common length.
 
-    t: times (NaN where padded), shape [events]; y: states (x1, x2), [events, 2]; kind: an
-    `EventKind` (0 where padded); belt: index of the belt concerned (-1 where padded), for EDGE
-    the belt whose interval ends or begins there, the lowest index where several are concerned.
+    Attributes:
+        t: Times, [events], NaN where padded.
+        y: States (x1, x2), [events, 2].
+        kind: An `EventKind`, [events], 0 where padded.
+        belt: Number of the belt, [events], -1 where padded. For EDGE it is the belt whose interval
+            ends or begins there, the lowest number where several do.
     """
 
     t: Array
@@ -64,7 +67,8 @@ class Events(eqx.Module):
     belt: Array
 
     def table(self) -> "pandas.DataFrame":
-        """A row for each event, in order: t, x1, x2, kind (the name of an `EventKind`), belt."""
+        """Returns a row for each event, in order; columns: t, x1, x2, kind (an `EventKind`'s
+        name), belt."""
         require_single(self, self.t, 1)
         happened = np.asarray(self.kind) > 0
         t, y, kind, belt = (np.asarray(x)[happened] for x in (self.t, self.y, self.kind, self.belt))
@@ -72,8 +76,14 @@ class Events(eqx.Module):
         return table_of({"t": t, "x1": y[:, 0], "x2": y[:, 1], "kind": names, "belt": belt})
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw which event happens when, a line for each kind and belt, into the axes `ax` (None:
-        new ones), which are returned."""
+        """Draws the events over time, a line for each kind and belt.
+
+        Args:
+            ax: Axes; None makes new ones.
+
+        Returns:
+            The axes.
+        """
         return draw(self, ax)
 
     def __repr__(self) -> str:
@@ -86,9 +96,14 @@ class Events(eqx.Module):
 class Arcs(eqx.Module):
     """The arcs of a trajectory: smooth pieces, each in one mode; padded like `Events`.
 
-    t: entry times, [arcs]; y: entry states, [arcs, 2]; mode: contact codes, [arcs, belts]
-    (+1/-1 slip with that sign of r, 0 stuck, -2/+2 mass below/above the belt's interval);
-    duration: [arcs]. Consecutive arcs of one mode occur: an arc also ends at an extremum.
+    Consecutive arcs of one mode occur: an arc also ends at an extremum.
+
+    Attributes:
+        t: Entry times, [arcs].
+        y: Entry states (x1, x2), [arcs, 2].
+        mode: Contact codes, [arcs, belts] (+1/-1 slip with that sign of r, 0 stuck, -2/+2 mass
+            below/above the belt's interval).
+        duration: Durations, [arcs].
     """
 
     t: Array
@@ -97,8 +112,11 @@ class Arcs(eqx.Module):
     duration: Array
 
     def table(self) -> "pandas.DataFrame":
-        """A row for each arc, in order: t, x1, x2 at its entry, duration, and contact_0, contact_1,
-        ..., the contact code of each belt."""
+        """Returns a row for each arc, in order.
+
+        Columns: t, x1, x2 at its entry, duration, and contact_0, contact_1, ..., the contact code
+        of each belt.
+        """
         require_single(self, self.t, 1)
         used = ~np.isnan(np.asarray(self.t))
         t, y, mode, duration = (
@@ -108,18 +126,28 @@ class Arcs(eqx.Module):
         return table_of(columns | per_belt("contact", mode))
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw the contact of each belt over time, as a bar, into the axes `ax` (None: new ones),
-        which are returned."""
+        """Draws the contact of each belt over time, as a bar.
+
+        Args:
+            ax: Axes; None makes new ones.
+
+        Returns:
+            The axes.
+        """
         return draw(self, ax)
 
 
 class Trajectory(eqx.Module):
-    """What `simulate` returns.
+    """The motion over a time span; what `simulate` returns.
 
-    ts: sample times, [samples]; ys: states (x1, x2) there, [samples, 2]; modes: contact codes of
-    each belt from that time on, [samples, belts] (+1/-1 slip with that sign of r_i, 0 stuck,
-    -2/+2 mass below/above the belt's interval); events: `Events`; arcs: `Arcs`; status: a
-    `Status` code. Samples that were not reached are NaN.
+    Attributes:
+        ts: Sample times tau, [samples].
+        ys: States (x1, x2) there, [samples, 2], NaN where samples were not reached.
+        modes: Contact codes of each belt from that time on, [samples, belts] (+1/-1 slip with that
+            sign of r_i, 0 stuck, -2/+2 mass below/above the belt's interval).
+        events: The `Events`.
+        arcs: The `Arcs`.
+        status: A `Status` code.
     """
 
     ts: Array
@@ -130,17 +158,27 @@ class Trajectory(eqx.Module):
     status: Array
 
     def table(self) -> "pandas.DataFrame":
-        """A row for each sample: t, x1, x2, and contact_0, contact_1, ..., the contact code of each
-        belt. Of events and arcs there are tables, too: `trajectory.events.table()`."""
+        """Returns a row for each sample.
+
+        Columns: t, x1, x2, and contact_0, contact_1, ..., the contact code of each belt.
+        `trajectory.events.table()` and `trajectory.arcs.table()` have the events and arcs.
+        """
         require_single(self, self.ts, 1)
         x1, x2 = np.asarray(self.ys).T
         columns = {"t": self.ts, "x1": x1, "x2": x2}
         return table_of(columns | per_belt("contact", self.modes))
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw displacement and velocity over time, stick phases shaded, into the axes `ax` (None:
-        new ones), which are returned. `plot_time_history` has axes for each of the two,
-        `plot_phase_portrait` the plane of both."""
+        """Draws displacement and velocity over time, stick phases shaded.
+
+        `plot_time_history` has axes for each of the two, `plot_phase_portrait` the plane of both.
+
+        Args:
+            ax: Axes; None makes new ones.
+
+        Returns:
+            The axes.
+        """
         return draw(self, ax)
 
     def __repr__(self) -> str:
@@ -157,7 +195,7 @@ class Trajectory(eqx.Module):
         )
 
 
-#: The default tolerances of a step, and width of the band of the switch model and of the smooth
+#: Default tolerances of a step, and default width of the band of the switch model and of the smooth
 #: one's tanh, in own units.
 SIMULATION_TOLERANCE, BAND_WIDTH = 1e-10, 1e-3
 
@@ -198,8 +236,10 @@ def _smoothed(given, y0, t0, t1, ts, rtol, atol, *, width, formulation, resoluti
 
 @jit
 def _filippov(
-    given, y0, t0, t1, ts, rtol, atol, *, rules, max_events, resolution, ends_at_t1
+    given, y0, t0, t1, ts, rtol, atol, *, rules, max_events, resolution, ends_at_t1, last=None
 ) -> Trajectory:
+    """last: the number of the row that is the end of the run, where this is no part of the program
+    (-1: none)."""
     osc = in_units_of_run(given)
     y0 = y0 / osc.units.length
     atol = in_units(atol, osc.units.length, SIMULATION_TOLERANCE)
@@ -228,9 +268,13 @@ def _filippov(
     rows, later = loop.place(numbers, numbers[: count.size])
     t = records.t[rows] + later * period
     arcs = Arcs(t, _without_clock(records.y)[rows], records.mode[rows], records.duration[rows])
+    if last is not None:
+        y1, mode1 = state_at_end(final, records, loop, t1)
+        is_last = (jnp.arange(ys.shape[0]) == last)[:, None]
+        ys, modes = jnp.where(is_last, y1, ys), jnp.where(is_last, mode1, modes)
     rows = wanted_times, ys, modes
     if ends_at_t1:
-        # The last row stands by itself: where it alone is used, no other sample is made.
+        # The last row is separate: where it alone is used, no other sample is computed.
         y1, mode1 = state_at_end(final, records, loop, t1)
         if ts is None:
             # An even grid, and between its points the entries of the arcs, which are known already.
@@ -282,33 +326,46 @@ def simulate(
 ) -> Trajectory:
     """The motion of the oscillator from y0 over [t0, t1].
 
-    osc: `Oscillator`. y0: start (x1, x2), shape [2]. t0 < t1: time span (dimensionless time
-    tau = omega t; that of the cosines where there is forcing). ts: the times wanted, increasing,
-    shape [n]; None gives an even grid with the ends of all arcs in it, and t1 last. For the reverse
-    mode of a function of the final state alone give ts=[t1]: else it makes the derivatives of every
-    sample. rtol, atol: tolerances of the integrator per step, atol a length (None: 1e-10 of the
-    oscillator's own size, see `own_units`); in a batch the smallest ones hold for all.
-
-    formulation: "filippov", the exact event-driven motion; "switch", the paper's switch model,
-    eqs. (21)-(23), with a band of half-width v_star around each boundary; "smooth", with
-    tanh(r/eps) in place of sgn(r); v_star and eps are velocities (None: 1e-3 of the oscillator's
-    own). The last two have no events.
-
-    max_segments: budget of arcs; None chooses one from the time span. A run that uses it up
-    returns what it has, with the status TOO_MANY_SEGMENTS. A loop behind a stick phase that repeats
-    to the last digit is followed once, and its arcs count every time. max_events: how many events
-    are given, with the same status where there were more; None: all of them, and under a
-    transformation, where there has to be room for them, about 4 (where edges are passed 16) a unit
-    of time.
+    The formulation "filippov" is exact and event-driven. "switch" is the paper's switch model, eqs.
+    (21)-(23), with a band of half-width v_star around each boundary; "smooth" has tanh(r/eps) in
+    place of sgn(r). The last two have no events.
 
     Works under `jax.jit`, `jax.vmap` (batches), `jax.jacfwd` and `jax.jacrev`. There the lengths
-    are padded (see `Events`); outside they are cut to what happened. Derivatives are those of the
-    arcs in their present order. Where this changes at the very numbers given, as where two belts
-    run at one velocity or an orbit grazes a boundary, the derivatives of the two sides differ, and
-    what is given may be neither: step aside by 1e-6 for that of one side. Velocities that stay
-    equal are varied together.
+    are padded (see `Events`); outside they are cut. Derivatives are those of the arcs in their
+    present order. Where this order changes exactly at the given numbers, as where two belts have
+    one velocity or an orbit grazes a boundary, the derivatives of the two sides differ, and the
+    returned one may be neither: step aside by 1e-6 for that of one side. Velocities that stay equal
+    are varied together.
 
-    `ValueError` names the argument that is impossible. See `Trajectory` for what comes back.
+    Args:
+        osc: The oscillator.
+        y0: Start (x1, x2), dimensionless, shape [2].
+        t1: End of the time span in dimensionless time tau = omega t, that of the cosines where
+            there is forcing.
+        t0: Beginning of the time span.
+        ts: Sample times, increasing, shape [n]; None: an even grid with the ends of all arcs in it,
+            and t1 last. For the reverse mode of a function of the final state alone give ts=[t1];
+            otherwise the derivatives of every sample are computed.
+        rtol: Relative tolerance of the integrator per step; in a batch the smallest one holds for
+            all.
+        atol: Absolute tolerance, a length, likewise; None: 1e-10 of the oscillator's own size, see
+            `own_units`.
+        formulation: "filippov", "switch" or "smooth".
+        v_star: Half-width of the switch model's band, a velocity; None: 1e-3 of the oscillator's
+            own.
+        eps: Width of the smooth formulation, likewise.
+        max_segments: Budget of arcs; None chooses one from the time span. A run that uses it up
+            returns what it has, with the status TOO_MANY_SEGMENTS. A loop behind a stick phase that
+            repeats to the last digit is followed once, and its arcs count every time.
+        max_events: Largest number of returned events, with the same status if there were more.
+            None: all; under a transformation, where there has to be room for them, about 4 (16
+            where edges are passed) for each unit of time.
+
+    Returns:
+        The `Trajectory`.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(osc)
     y0 = as_numbers(y0, "y0", (2,))
@@ -327,6 +384,14 @@ def simulate(
         '"filippov", "switch" or "smooth"',
         repr(formulation),
     )
+    padded = not is_concrete((osc, y0, t0, t1, ts, rtol, atol))
+    ends_at_t1 = ts is None or (
+        is_concrete((ts, t1)) and np.size(ts) > 0 and bool(np.asarray(ts)[-1] == t1)
+    )
+    samples = None
+    if ts is not None and not padded and np.size(ts) > 1:
+        samples = np.size(ts)
+        ts = np.pad(np.asarray(ts), (0, _rows_for(samples) - samples), mode="edge")
     given = y0, t0, t1, ts, rtol, atol
     span = float(t1 - t0) if is_concrete((t0, t1)) else 100.0
     resolution = 0 if ts is not None else _room_for(10 * span, 512)
@@ -334,23 +399,22 @@ def simulate(
         name = "v_star" if formulation == "switch" else "eps"
         width = as_size(v_star if formulation == "switch" else eps, name)
         fixed = dict(formulation=formulation, resolution=resolution)
-        return _smoothed(osc, *given, width=width, **fixed)
-    padded = not is_concrete((osc, given))
+        found = _smoothed(osc, *given, width=width, **fixed)
+        return found if samples is None else _first_samples(found, samples)
     edges = has_edges(osc)
     busy = span * _busyness(osc)
     rules, max_events = _budgets(max_segments, max_events, busy, len(osc.belts), edges, padded)
-    ends_at_t1 = ts is None or (
-        is_concrete((ts, t1)) and np.size(ts) > 0 and bool(np.asarray(ts)[-1] == t1)
-    )
+    last = None if samples is None else np.asarray(samples - 1 if ends_at_t1 else -1)
     trajectory = _filippov(
         osc if edges else without_edges(osc),
         *given,
         rules=rules,
         max_events=max_events,
         resolution=resolution,
-        ends_at_t1=ends_at_t1,
+        ends_at_t1=ends_at_t1 and samples is None,
+        last=last,
     )
-    return _without_padding(trajectory, trim_samples=ts is None)
+    return _without_padding(trajectory, trim_samples=ts is None, samples=samples)
 
 
 def _busyness(osc: Oscillator) -> float:
@@ -368,8 +432,10 @@ def _budgets(
     edges: bool,
     padded: bool,
 ) -> tuple[Rules, int]:
-    """How many arcs a run may have and how many events are given, by default or as told, or a
-    `ValueError`; padded: whether there has to be room for all of them."""
+    """Largest numbers of arcs and of returned events, by default or as given, or a `ValueError`.
+
+    padded: whether there has to be room for all of them.
+    """
     expected, is_default = "a positive integer", max_segments is None
     if max_segments is None:
         # Around a pseudo-focus at a contact edge a run has many short arcs.
@@ -391,7 +457,7 @@ def _budgets(
 
 
 def _checked_times(ts: ArrayLike | list | tuple, t0: ArrayLike, t1: ArrayLike) -> ArrayLike:
-    """The wanted times, or a `ValueError`."""
+    """Checks the sample times."""
     ts = as_numbers(ts, "ts", (None,))
     check_finite(ts, "ts")
     if is_concrete((ts, t0, t1)):
@@ -405,8 +471,30 @@ def _room_for(value: float, least: int) -> int:
     return power_of_two(math.ceil(min(value, 2.0**20)), least)
 
 
-def _without_padding(trajectory: Trajectory, *, trim_samples: bool) -> Trajectory:
-    """Cut the padding off where lengths are known, that is, outside of transformations."""
+#: Fewest rows of samples; rows are computed in so many lanes.
+FEWEST_SAMPLES = 32
+
+
+def _rows_for(samples: int) -> int:
+    """Rows that are computed for so many wanted times, so that few programs are compiled."""
+    room = power_of_two(samples, FEWEST_SAMPLES)
+    less = 3 * room // 4
+    return less if samples <= less and less % FEWEST_SAMPLES == 0 else room
+
+
+def _first_samples(trajectory: Trajectory, count: int) -> Trajectory:
+    known = (trajectory.ts, trajectory.ys, trajectory.modes)
+    rows = jax.device_put([np.asarray(leaf)[:count] for leaf in known])
+    return eqx.tree_at(lambda one: (one.ts, one.ys, one.modes), trajectory, tuple(rows))
+
+
+def _without_padding(
+    trajectory: Trajectory, *, trim_samples: bool, samples: int | None = None
+) -> Trajectory:
+    """Cut the padding off where lengths are known, that is, outside of transformations.
+
+    samples: how many rows were wanted; None: all.
+    """
     if not is_concrete(trajectory) or trajectory.ts.ndim != 1:
         return trajectory
     known = jax.tree.map(np.asarray, trajectory)
@@ -414,11 +502,11 @@ def _without_padding(trajectory: Trajectory, *, trim_samples: bool) -> Trajector
     def rows(tree, numbers):
         return jax.tree.map(lambda leaf: leaf[numbers], tree)
 
-    samples = (known.ts, known.ys, known.modes)
+    wanted = rows((known.ts, known.ys, known.modes), slice(samples))
     if trim_samples:
-        samples = rows(samples, np.flatnonzero(np.diff(known.ts, prepend=-np.inf)))
+        wanted = rows(wanted, np.flatnonzero(np.diff(known.ts, prepend=-np.inf)))
     events = rows(known.events, np.flatnonzero(known.events.kind))
     arcs = rows(known.arcs, np.flatnonzero(~np.isnan(known.arcs.t)))
     # Put there as they are: jnp.asarray compiles a program for every shape.
-    (ts, ys, modes), events, arcs = jax.device_put((samples, events, arcs))
+    (ts, ys, modes), events, arcs = jax.device_put((wanted, events, arcs))
     return Trajectory(ts, ys, modes, events, arcs, trajectory.status)

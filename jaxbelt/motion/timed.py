@@ -6,12 +6,13 @@ of its guards vanishes within, by what all guards are at its ends: value, slope 
 the motion, by derivatives of the field. A quintic has these values; in the basis of Bernstein it
 lies within its six control points. Where these, less the error of the quintic, are positive, the
 guard is. Where the guard is negative at the end and the control points fall, it has one root.
-Otherwise the step is halved. The error of the quintic is at most |g''''''| h^6/46080; steps are
-half a radian of the fastest wave or shorter, and there `SHARE` of its distance from the cubic with
-the same values and slopes, about |g''''| h^4/480 at the control points, is more: for a wave of
-frequency Omega the ratio of the two is (Omega h)^2/96, or 1/400. Slip and stick phases are proved
-in the same way; in stick phases the state is in closed form. A double root, where control points
-are negative by rounding only, is touched, and the arc goes on.
+Otherwise the step is halved. The error of the quintic is at most |g(6)| h^6/46080, g(n) being the
+derivative of order n. Its control points are |g(4)| h^4/240 away from those of the cubic with the
+same values and slopes, and a quarter of that, `QUINTIC_SHARE`, is taken for its error: for a wave
+of frequency Omega it is 48 over (Omega h)^2 times as much, and no step is longer than half a radian
+of the fastest wave. Slip and stick phases are proved in the same way; in stick phases the state is
+in closed form. A double root, where control points are negative by rounding only, is touched, and
+the arc goes on.
 """
 
 import functools
@@ -23,17 +24,17 @@ from jax import lax
 from jaxtyping import Array
 
 from ..model.instants import (
-    ROUNDING,
-    Course,
+    GUARD_ROUNDING,
     TimedState,
+    Trend,
     carried,
-    course,
     field_at,
     guard_sizes,
     guards_at,
     is_held_for_ever,
     on_guard_at,
     passed_guard,
+    trend_of,
 )
 from ..model.modes import Mode, select
 from ..model.oscillator import Oscillator, fastest
@@ -42,18 +43,18 @@ from ..numerics.roots import first_root
 from .arcs import ArcEnd
 
 #: Longest step, times the highest frequency; the first one of an arc.
-LONGEST, FIRST = 0.5, 0.05
+LONGEST_OF_WAVE, FIRST_OF_WAVE = 0.5, 0.05
 #: Steps are not halved below this; what is not decided there is rounding.
-SHORTEST = 1e-8
+SHORTEST_STEP = 1e-8
 #: Part of the distance between cubic and quintic that bounds the error of the quintic.
-SHARE = 0.25
+QUINTIC_SHARE = 0.25
 #: A guard above minus this, times `guard_sizes`, has not passed zero.
-TOUCH = 0.1 * ROUNDING
+TOUCH = 0.1 * GUARD_ROUNDING
 #: Steps before an arc is given up.
-MOST_STEPS = 20_000
+MOST_TIMED_STEPS = 20_000
 #: Longest slip arc; longer ones are cut.
-MAX_ARC = 1.0
-_ORDER_8 = scheme((2, 4, 6, 8), (2, 4, 6))
+LONGEST_TIMED_ARC = 1.0
+_BOTH_ORDERS = scheme((2, 4, 6, 8), (2, 4, 6))
 
 
 class _March(NamedTuple):
@@ -63,7 +64,7 @@ class _March(NamedTuple):
 
     passed: Array
     y: TimedState
-    at: Course
+    at: Trend
     shifts: Array
     h: Array
     hit: Array
@@ -75,7 +76,7 @@ class _March(NamedTuple):
 def _stepped(osc: Oscillator, mode: Mode, y: TimedState, h: Array):
     """The state a time h later, and an estimate of its error in x1 and x2."""
     field = functools.partial(field_at, osc, mode)
-    best, lower = increments(lambda y: field(y), y, h, _ORDER_8)
+    best, lower = increments(lambda y: field(y), y, h, _BOTH_ORDERS)
     slipped = tuple(a + b for a, b in zip(y, best, strict=True))
     errors = tuple(jnp.abs(a - b) for a, b in zip(best[:2], lower[:2], strict=True))
     stuck = mode.any_stuck
@@ -83,7 +84,7 @@ def _stepped(osc: Oscillator, mode: Mode, y: TimedState, h: Array):
     return select(stuck, (carried(osc, mode, y, h), (zero, zero)), (slipped, errors))
 
 
-def _control_points(at: Course, end: Course, h: Array) -> tuple[Array, Array]:
+def _control_points(at: Trend, end: Trend, h: Array) -> tuple[Array, Array]:
     """The control points of the quintics through both ends, [6, guards], and their error."""
     b = [at.value, at.value + 0.2 * h * at.slope]
     b += [at.value + 0.4 * h * at.slope + 0.05 * h**2 * at.curvature]
@@ -94,20 +95,20 @@ def _control_points(at: Course, end: Course, h: Array) -> tuple[Array, Array]:
     third = (p[0] + 6 * p[1] + 3 * p[2]) / 10
     fourth = (3 * p[1] + 6 * p[2] + p[3]) / 10
     away = jnp.maximum(jnp.abs(b[2] - third), jnp.abs(b[3] - fourth))
-    return jnp.stack(b), SHARE * away
+    return jnp.stack(b), QUINTIC_SHARE * away
 
 
-def _finite(at: Course) -> Course:
+def _finite(at: Trend) -> Trend:
     """Guards that are not there as ones that stay positive."""
     there = jnp.isfinite(at.value)
-    return Course(
+    return Trend(
         jnp.where(jnp.isposinf(at.value), 1.0, at.value),
         jnp.where(there, at.slope, 0.0),
         jnp.where(there, at.curvature, 0.0),
     )
 
 
-def first_guard(osc: Oscillator, mode: Mode, y: TimedState, longest: Array, rtol, atol):
+def first_vanishing(osc: Oscillator, mode: Mode, y: TimedState, longest: Array, rtol, atol):
     """The motion of a mode until a guard vanishes, or for the time `longest`.
 
     Returns its duration, its end, the number of the guard in `guards_at` or -1, and whether it was
@@ -115,16 +116,16 @@ def first_guard(osc: Oscillator, mode: Mode, y: TimedState, longest: Array, rtol
     friction bends most: so that arcs have one bend, at an end.
     """
     n = len(osc.belts)
-    most = LONGEST / fastest(osc)
+    most = LONGEST_OF_WAVE / fastest(osc)
     sizes = guard_sizes(osc, y)
     stuck = mode.any_stuck
 
     def look(y):
-        return _finite(course(osc, mode, lambda y: guards_at(osc, mode, y), y))
+        return _finite(trend_of(osc, mode, lambda y: guards_at(osc, mode, y), y))
 
     def unfinished(state: _March):
         going = (state.passed < longest) & ~state.hit & ~state.stops & ~state.failed
-        return going & (state.count < MOST_STEPS)
+        return going & (state.count < MOST_TIMED_STEPS)
 
     def advance(state: _March) -> _March:
         rest = longest - state.passed
@@ -134,7 +135,7 @@ def first_guard(osc: Oscillator, mode: Mode, y: TimedState, longest: Array, rtol
         larger = [jnp.maximum(jnp.abs(a), jnp.abs(b)) for a, b in zip(state.y[:2], y[:2])]
         terms = [e / (atol + rtol * size) for e, size in zip(errors, larger, strict=True)]
         error = functools.reduce(jnp.maximum, terms)
-        accurate = (error <= 1) | (h <= SHORTEST) & jnp.isfinite(error)
+        accurate = (error <= 1) | (h <= SHORTEST_STEP) & jnp.isfinite(error)
         # Whether guards vanish within the step.
         shifted = state.at.value + state.shifts, end.value + state.shifts
         points, astray = _control_points(
@@ -142,7 +143,7 @@ def first_guard(osc: Oscillator, mode: Mode, y: TimedState, longest: Array, rtol
         )
         none = jnp.min(points, axis=0) - astray > -TOUCH * sizes
         falls = jnp.max(jnp.diff(points, axis=0), axis=0) + 2 * astray < 0
-        tiny = h <= SHORTEST
+        tiny = h <= SHORTEST_STEP
         negative = shifted[1] < -TOUCH * sizes
         once = ~none & negative & (falls | tiny)
         clear = none | once | tiny
@@ -168,14 +169,14 @@ def first_guard(osc: Oscillator, mode: Mode, y: TimedState, longest: Array, rtol
             h_next,
             hit,
             stops,
-            ~accurate & (h <= SHORTEST),
+            ~accurate & (h <= SHORTEST_STEP),
             state.count + 1,
         )
 
     at = look(y)
-    shifts = jnp.where(jnp.abs(at.value) <= ROUNDING * sizes, 2 * ROUNDING * sizes, 0.0)
+    shifts = jnp.where(jnp.abs(at.value) <= GUARD_ROUNDING * sizes, 2 * GUARD_ROUNDING * sizes, 0.0)
     no = jnp.asarray(False)
-    start = _March(jnp.zeros(()), y, at, shifts, FIRST * most, no, no, no, jnp.asarray(0))
+    start = _March(jnp.zeros(()), y, at, shifts, FIRST_OF_WAVE * most, no, no, no, jnp.asarray(0))
     last = lax.while_loop(unfinished, advance, start)
     length = jnp.where(last.hit, last.h, 0.0)
 
@@ -192,7 +193,7 @@ def first_guard(osc: Oscillator, mode: Mode, y: TimedState, longest: Array, rtol
     h = jnp.where(number >= 0, h, length)
     y, _ = _stepped(osc, mode, last.y, h)
     y = select(last.hit, y, last.y)
-    failed = last.failed | (last.count >= MOST_STEPS)
+    failed = last.failed | (last.count >= MOST_TIMED_STEPS)
     return last.passed + h, y, number, failed
 
 
@@ -209,9 +210,9 @@ def timed_arc(osc: Oscillator, mode: Mode, y: TimedState, t1: Array, rtol, atol)
     remaining = t1 - y[2]
     forever = stuck & is_held_for_ever(osc, mode, y)
     # Cut where slip arcs are followed once more for their derivatives.
-    longest = jnp.where(stuck, remaining, jnp.minimum(remaining, MAX_ARC))
+    longest = jnp.where(stuck, remaining, jnp.minimum(remaining, LONGEST_TIMED_ARC))
     looked = jnp.where(forever, 0.0, longest)
-    duration, y_end, number, failed = first_guard(osc, mode, y, looked, rtol, atol)
+    duration, y_end, number, failed = first_vanishing(osc, mode, y, looked, rtol, atol)
     y_end = select(forever, carried(osc, mode, y, remaining), y_end)
     duration = jnp.where(forever, remaining, duration)
     y_end = on_guard_at(osc, mode, number, y_end)

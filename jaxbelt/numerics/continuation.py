@@ -75,7 +75,7 @@ def continue_curve(
 
     solve: gives the point of the curve of (u, tangent, length), such as
     `functools.partial(corrected, linearized, args)`. start: a guess of the first point. direction:
-    [n + 1], the way to go from there, as its angle with the tangent tells. span: smallest and
+    [n + 1], the direction from there, by its angle with the tangent. span: smallest and
     largest u, numbers or [n + 1]; the curve ends with a point on the first side that it meets.
     step, min_step, max_step: lengths of the first, the shortest and the longest chord.
 

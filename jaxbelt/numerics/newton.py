@@ -30,7 +30,7 @@ LONGEST_NEWTON_STEP = 0.5
 HOLDS = 1e-9
 #: Steps of this length are rounding: unknowns are of size one.
 STEP_ROUNDING = 1e-13
-#: Steps that tell how far unknowns move that do not settle.
+#: Number of last steps that measure how far unknowns still move that do not converge.
 LAST = 4
 #: Larger unknowns are of another size, such as the time stuck to a belt that hardly moves: steps
 #: are measured in parts of them.
@@ -151,14 +151,18 @@ def moving_and_fixed(given: Any, tangents: Any) -> tuple[Any, Any]:
     return eqx.partition(given, has_one)
 
 
-def solve(equations: Equations, given: Any, start: Any) -> Newton:
+def solve(
+    equations: Equations, given: Any, start: Any, *, longest: float = LONGEST_NEWTON_STEP
+) -> Newton:
     """The solution of the equations near `start`, differentiable with respect to `given`.
 
     By the implicit function theorem, in forward and reverse mode. `start` is a guess: nothing
     depends on it.
     """
     still, start = lax.stop_gradient((given, start))
-    solved = lax.stop_gradient(newton(lambda z: equations.linearized(still, z), start))
+    solved = lax.stop_gradient(
+        newton(lambda z: equations.linearized(still, z), start, longest=longest)
+    )
     return eqx.tree_at(lambda n: n.z, solved, solution(equations, given, solved.z))
 
 

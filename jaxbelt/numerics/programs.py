@@ -293,7 +293,7 @@ def _config() -> Any:
 
 @functools.cache
 def are_kept() -> bool:
-    """Whether programs are kept at all: it is not switched off, and JAX tells its settings."""
+    """Whether programs are kept: it is not switched off, and JAX's settings are known."""
     try:
         return ON and isinstance(jax_settings(), tuple)
     except Exception as error:
@@ -316,7 +316,7 @@ def can_be_kept(arrays: list[Any]) -> bool:
 
 
 def key_of(function: Callable, template: Any, signatures: Sequence[Any], options: Any) -> str:
-    """What a program is known by; an error where this cannot be told."""
+    """Identity of a program; raises where this cannot be known."""
     name = getattr(function, "__module__", ""), getattr(function, "__qualname__", "")
     told = fingerprint((name, function, template, options))
     # Without what has no name but its address: an object of JAX, empty outside of traces.
@@ -441,7 +441,7 @@ def _results_in(pickled: bytes, known: list[Any]) -> tuple[Any, list[Any]]:
 
 
 # A user's classes and functions are in arguments and come back in results. They cannot be found by
-# name, so a file tells their places among those of the arguments.
+# name, so a file contains their places among those of the arguments.
 
 
 def _own_objects(template: Any) -> list[Any]:

@@ -4,7 +4,7 @@ Guards are positive at the start of the step and negative beyond their root. The
 has kinks, on which a search for its root may end, and near a tangency one guard is small where
 another has its root. So each is searched for by itself. The extrema come first, the zeros of x2'
 and of x2: up to an extremum the other guards are monotone, and the sign of one at the extremum, as
-accurate as the integration, tells whether it has a root before.
+accurate as the integration, shows whether it has a root before.
 """
 
 from collections.abc import Callable

@@ -15,7 +15,7 @@ from ..activity import announced
 from ..checks import as_numbers, check_finite, check_positive
 from ..model.friction import LawInUnits
 from ..model.machine import Machine, PhysicalBelt, Units
-from ..model.oscillator import Oscillator, check_oscillator
+from ..model.oscillator import Oscillator, check_oscillator, refuse_clock
 from ..model.parameters import names_of
 from ..motion.simulate import simulate
 from ..results import Status, describe
@@ -94,7 +94,7 @@ class Explorer:
         shown = jax.tree.unflatten(self._structure, values)
         if isinstance(shown, Machine):  # made anew, so that its checks run
             belts = [PhysicalBelt(**vars(belt)) for belt in shown.belts]
-            return Machine(shown.mass, shown.stiffness, shown.damping, belts)
+            return Machine(shown.mass, shown.stiffness, shown.damping, belts, shown.forcing)
         check_oscillator(shown)
         return shown
 
@@ -173,6 +173,7 @@ def explore(
         length, time = float(osc.units.length), float(osc.units.time)
     else:
         check_oscillator(osc)
+    refuse_clock(osc.oscillator if isinstance(osc, Machine) else osc, "explore", "jb.simulate")
     start = (1.5 * length, 0.0) if start is None else start
     t1 = 60.0 * time if t1 is None else t1
     state, until = as_numbers(start, "start", (2,)), as_numbers(t1, "t1")

@@ -31,7 +31,7 @@ from ..cycles.separatrices import Separatrix
 from ..model.equilibria import Equilibria, EquilibriumKind, stability
 from ..model.equilibria import equilibria as find_equilibria
 from ..model.modes import mode_acceleration
-from ..model.oscillator import Oscillator, check_oscillator, constant_force
+from ..model.oscillator import Oscillator, check_oscillator, constant_force, refuse_clock
 from ..model.transitions import mode_of_state
 from ..motion.simulate import Trajectory
 from ..numerics.compiling import jit
@@ -218,6 +218,7 @@ def plot_phase_portrait(
         ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(osc)
+    refuse_clock(osc, "plot_phase_portrait", "plot_time_history(trajectory)")
     if isinstance(trajectories, Trajectory):
         trajectories = (trajectories,)
     many = isinstance(trajectories, Sequence)
@@ -533,6 +534,7 @@ def plot_vector_field(
         ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(osc)
+    refuse_clock(osc, "plot_vector_field", "plot_time_history(trajectory)")
     require_one_of(kind, ("streamlines", "arrows"), "kind")
     _check_window(xlim, ylim)
     require_axes(ax)

@@ -1,6 +1,6 @@
 """Style of the pictures: colours, keys, a journal's page; and axes to draw into.
 
-The colours are those of Okabe and Ito, which colour-blind readers can tell apart. Only the modules
+The colours are those of Okabe and Ito, which colour-blind readers can distinguish. Only the modules
 of this folder import matplotlib, and `import jaxbelt` imports none of them.
 """
 
@@ -53,6 +53,13 @@ PARAMETERS = {
     "quadratic": ("quadratic friction", r"p_{2,%}"),
     "steepness": ("steepness of friction", r"p_{3,%}"),
     "friction.velocity": ("Stribeck velocity", r"v_{s,%}"),
+    "velocity.mean": ("mean belt velocity", r"\nu_%"),
+    "velocity.amplitude": ("amplitude of belt velocity", r"a_%"),
+    "load.mean": ("mean load", r"u_{0,%}"),
+    "load.amplitude": ("amplitude of load", ""),
+    "amplitude": ("amplitude of forcing", "F"),
+    "frequency": ("frequency of forcing", r"\Omega"),
+    "phase": ("phase of forcing", r"\varphi"),
     "nu": ("belt velocity", r"\nu_%"),
     "sigma": ("contact edge", r"\sigma_%"),
     "zeta": ("damping", r"\zeta"),

@@ -1,12 +1,13 @@
-"""Reducers that see the smooth stretches of a motion, too: moments in it and integrals over it.
+"""Reducers that are asked between events, too: at moments of the motion, with integrals over it.
 
-Steps are those of `step.take_step`. One that passes a section is made again, shorter, until an end
-of it is so near to the crossing that a Taylor step leads there; the run itself goes on from the
-step's end. Stick phases are known in closed form. Integrals are summed by the stages of the steps,
-as the motion is, and over stick phases by Gauss's rule.
+Steps are those of `step.take_step`. A step that passes a section is repeated with a shorter length
+until one of its ends is so near to the crossing that a Taylor step leads there; the run itself goes
+on from the end of the step. Stick phases are known in closed form. Integrals are summed by the
+stages of the steps, as the motion is, and over stick phases by Gauss's rule.
 
-Where a moment is carries no derivative as it is found. A Newton step from there, of size 0 but for
-rounding, gives it that of the implicit function, and so results have right derivatives.
+The time of a moment carries no derivative as it is found. A Newton step from there, of size 0 but
+for rounding, gives it the derivative of the implicit function, so results have the right
+derivatives.
 """
 
 import functools
@@ -24,11 +25,14 @@ from jaxtyping import Array
 from ..kernel.events import event_kinds
 from ..kernel.lanes import Lanes, Observer, choose, materialise
 from ..kernel.step import LANDING
+from ..model.instants import field_at
 from ..model.modes import Mode, mode_acceleration
+from ..model.oscillator import at_time, has_clock
 from ..model.own_units import OwnOscillator
 from .moments import (
     PARTS_OF_STEP,
     AtEvents,
+    AtPhase,
     AtTimes,
     Course,
     Cut,
@@ -46,8 +50,15 @@ NODES = [(0.5 * (1 + x), 0.5 * w) for x, w in zip(*np.polynomial.legendre.leggau
 
 
 class Motion(eqx.Module):
-    """A state of a run, as `rates` sees it: scalars t, x1, x2, a (which is x2'), and forces, the
-    friction force of each belt on the mass, [belts]."""
+    """State of a run as `rates` sees it.
+
+    Attributes:
+        t: Time, scalar.
+        x1: Displacement, scalar.
+        x2: Velocity, scalar.
+        a: Acceleration x2', scalar.
+        forces: Friction force of each belt on the mass, [belts].
+    """
 
     t: Array
     x1: Array
@@ -57,8 +68,11 @@ class Motion(eqx.Module):
 
 
 class _Watched(eqx.Module):
-    """What is known of the runs: the reducer's state, the side of each section, and the number of
-    fixed times that are past, each [lanes]."""
+    """Memory of the runs, arrays [lanes].
+
+    state: of the reducer; sides: the side of each section; passed: number of fixed times that are
+    past.
+    """
 
     state: Any
     sides: tuple[Array, ...]
@@ -66,7 +80,7 @@ class _Watched(eqx.Module):
 
 
 class Along(Observer):
-    """What a reducer with moments or integrals makes of a run; see `sweep.sweep`."""
+    """Observer of a reducer with moments or integrals; see `sweep.sweep`."""
 
     reducer: Any = eqx.field(static=True)
 
@@ -79,14 +93,12 @@ class Along(Observer):
         return [
             (i, getattr(moment, "direction", 0), section_of(moment))
             for i, moment in enumerate(self.at)
-            if not isinstance(moment, AtEvents | AtTimes)
+            if not isinstance(moment, AtEvents | AtTimes | AtPhase)
         ]
 
-    def _times(self) -> list[tuple[int, tuple[float, ...]]]:
+    def _times(self) -> list[tuple[int, AtTimes | AtPhase]]:
         return [
-            (i, tuple(moment.times))
-            for i, moment in enumerate(self.at)
-            if isinstance(moment, AtTimes)
+            (i, moment) for i, moment in enumerate(self.at) if isinstance(moment, AtTimes | AtPhase)
         ]
 
     # --- integrals
@@ -95,10 +107,12 @@ class Along(Observer):
         """The reducer's rates, a tree of arrays [lanes], or None if it has none."""
         if not hasattr(self.reducer, "rates"):
             return None
-        residual = mode_acceleration(osc, mode, x1, x2)
+        now = at_time(osc, t)
+        residual = mode_acceleration(now, mode, x1, x2)
         length = osc.units.length
-        a = length * jnp.where(mode.any_stuck, 0.0, residual)
-        forces = jnp.stack([length * f for f in _forces(osc, mode, x2, residual)], axis=-1)
+        a = jnp.where(mode.any_stuck, 0.0, residual)
+        a = length * (_field(osc, mode, t, x1, x2) if has_clock(osc) else a)
+        forces = jnp.stack([length * f for f in _forces(now, mode, x2, residual)], axis=-1)
 
         def rates(osc, x1, x2, *rest):
             return self.reducer.rates(osc, Motion(rest[0], x1, x2, *rest[1:]))
@@ -108,14 +122,14 @@ class Along(Observer):
     def start(self, osc, lanes):
         sides = []
         for _, _, function in self._sections():
-            value, rate = value_and_rate(function, osc, lanes.mode, lanes.x1, lanes.x2)
+            value, rate = _told(function, osc, lanes, lanes.x1, lanes.x2)
             sides.append(side_of(value, rate, jnp.ones_like(value)))
-        passed = tuple(jnp.zeros_like(lanes.events) for _ in self._times())
+        passed = tuple(one.passed_at(osc, lanes.t, lanes.events) for _, one in self._times())
         state = as_given(self.reducer.init, osc, lanes.x1, lanes.x2)
         return _Watched(state, tuple(sides), passed)
 
     def integrals(self, osc, lanes):
-        """Zeros: integrals of runs that begin."""
+        """Zeros: the integrals of runs that begin."""
         return jax.tree.map(
             jnp.zeros_like, self.rates(osc, lanes.mode, lanes.t, lanes.x1, lanes.x2)
         )
@@ -126,7 +140,7 @@ class Along(Observer):
         seen: _Watched = lanes.memory
         until = t1
         for (_, times), passed in zip(self._times(), seen.passed, strict=True):
-            until = jnp.minimum(until, _next(times, passed))
+            until = jnp.minimum(until, times.next_time(osc, passed))
         rates = self.rates if hasattr(self.reducer, "rates") else None
         new = take_step(osc, window, ones, lanes, until, rtol, atol, rates)
         h, reach = lax.stop_gradient(new.t - lanes.t), LANDING * jnp.sqrt(rtol)
@@ -137,7 +151,7 @@ class Along(Observer):
         cuts = []
         for (_, _, function), side in zip(self._sections(), seen.sides, strict=True):
             looks = [
-                course.look(function, osc, lanes.mode, jnp.full_like(h, k / PARTS_OF_STEP))
+                course.sample(function, osc, lanes.mode, jnp.full_like(h, k / PARTS_OF_STEP))
                 for k in range(PARTS_OF_STEP + 1)
             ]
             looks = [(materialise(v, ones), materialise(r, ones)) for v, r in looks]
@@ -152,9 +166,9 @@ class Along(Observer):
         seen, sides = new.memory, []
         parts = zip(self._sections(), seen.sides, cuts, strict=True)
         for (number, direction, function), side, cut in parts:
-            now = value_and_rate(function, osc, new.mode, new.x1, new.x2)
+            now = _told(function, osc, new, new.x1, new.x2)
             now = jnp.where(kept, side_of(*now, side), side)
-            # The end that is nearer, and from there by Taylor steps.
+            # The nearer end; from there a Taylor step leads to the crossing.
             near = choose(cut.at_start, lanes, new)
             delta = jnp.zeros_like(near.t)
             for _ in range(2):
@@ -165,7 +179,7 @@ class Along(Observer):
             sides.append(now)
         passed = []
         for (number, times), count in zip(self._times(), seen.passed, strict=True):
-            due = kept & (new.t >= _next(times, count))
+            due = kept & (new.t >= times.next_time(osc, count))
             seen = self._ask(seen, osc, new, jnp.zeros_like(new.t), due, number)
             passed.append(count + jnp.where(due, 1, 0))
         memory = replace(seen, sides=tuple(sides), passed=tuple(passed))
@@ -184,7 +198,8 @@ class Along(Observer):
         return self._update(seen, osc, place, number, totals, wanted)
 
     def _update(self, seen: _Watched, osc, place: Any, number, totals, wanted) -> _Watched:
-        """The state after an update where it is wanted; place: t, x1, x2, kind and belt."""
+        """The state after an update in lanes where `wanted` holds; place: t, x1, x2, kind and
+        belt."""
         t, x1, x2, kind, belt = place
         number = jnp.broadcast_to(jnp.asarray(number, int), t.shape)
         length = osc.units.length
@@ -212,8 +227,8 @@ class Along(Observer):
         lanes = replace(lanes, integrals=totals)
         sides = []
         for (number, direction, function), side in zip(self._sections(), seen.sides, strict=True):
-            # Where the field jumps, its extrema do.
-            value = value_and_rate(function, osc, lanes.mode, lanes.x1, lanes.x2)
+            # Where the field jumps, its extrema jump, too.
+            value = _told(function, osc, lanes, lanes.x1, lanes.x2)
             now = jnp.where(busy & ~lanes.done, side_of(*value, side), side)
             wanted = (now != side) & (now * direction >= 0)
             seen = self._ask(seen, osc, lanes, jnp.zeros_like(lanes.t), wanted, number)
@@ -221,7 +236,7 @@ class Along(Observer):
         return replace(lanes, memory=replace(seen, sides=tuple(sides)))
 
     def _over_hold(self, osc, before: Lanes, after: Lanes, holds) -> Any:
-        """The integrals after a stick phase, or rest."""
+        """Integrals after a stick phase, or rest."""
         duration = jnp.where(holds, after.t - before.t, 0.0)
         totals = after.integrals
         for node, weight in NODES if totals is not None else ():
@@ -233,25 +248,25 @@ class Along(Observer):
         return totals
 
     def _held(self, seen: _Watched, osc, ones, before: Lanes, after: Lanes, holds) -> _Watched:
-        """Moments within a stick phase, or rest, in their order: x1 moves evenly."""
+        """Takes the moments within a stick phase, or rest, in their order: x1 moves evenly."""
         frozen, start, end = lax.stop_gradient((osc, before, after))
         course = Course((start.x1, end.x1 - start.x1), start.x2, end.t - start.t)
         tables, sides = [], []
         for (_, direction, function), side in zip(self._sections(), seen.sides, strict=True):
 
-            def look(theta, function=function):
-                told = course.look(function, frozen, start.mode, theta)
-                return materialise(told[0], ones), materialise(told[1], ones)
+            def sample(theta, function=function):
+                values = course.sample(function, frozen, start.mode, theta)
+                return materialise(values[0], ones), materialise(values[1], ones)
 
-            side, *table = crossings_held(look, side, direction, holds)
+            side, *table = crossings_held(sample, side, direction, holds)
             sides.append(side)
             tables.append(tuple(table))
         seen = replace(seen, sides=tuple(sides))
 
         def pending(state):
             seen, tables = state
-            left = [jnp.any(self._due(seen, after))]
-            return jnp.any(jnp.stack(left + [jnp.any(jnp.isfinite(_first(t))) for t in tables]))
+            due = [jnp.any(self._due(seen, after))]
+            return jnp.any(jnp.stack(due + [jnp.any(jnp.isfinite(_first(t))) for t in tables]))
 
         def ask(state):
             seen, tables = state
@@ -259,16 +274,16 @@ class Along(Observer):
 
         return lax.while_loop(pending, ask, (seen, tables))[0]
 
-    def _due(self, seen: _Watched, after: Lanes) -> Array:
-        """The lanes that have passed a fixed time; at the start of a run, too."""
+    def _due(self, seen: _Watched, osc: OwnOscillator, after: Lanes) -> Array:
+        """Lanes that have passed a fixed time, also at the start of a run."""
         late = [
-            _next(times, passed) <= after.t
+            times.next_time(osc, passed) <= after.t
             for (_, times), passed in zip(self._times(), seen.passed, strict=True)
         ]
         return (after.run >= 0) & functools.reduce(jnp.logical_or, late, jnp.zeros_like(after.done))
 
     def _ask_next_held(self, seen: _Watched, tables, osc, before, after, holds):
-        """The state after the next moment of each lane, and the tables without it."""
+        """The state after the next moment of each lane, and the tables without that moment."""
         duration = after.t - before.t
         safe = jnp.where(duration > 0, duration, 1.0)
         theta, number = jnp.full_like(duration, jnp.inf), jnp.zeros(duration.shape, int)
@@ -278,7 +293,7 @@ class Along(Observer):
             theta = jnp.minimum(theta, first)
         exact, passed = before.t + jnp.where(jnp.isfinite(theta), theta, 0.0) * duration, []
         for (moment, times), count in zip(self._times(), seen.passed, strict=True):
-            time = _next(times, count)
+            time = times.next_time(osc, count)
             due = (after.run >= 0) & (time <= after.t)
             time = jnp.where(due, time, after.t)
             earlier = due & ((time - before.t) / safe <= lax.stop_gradient(theta))
@@ -315,49 +330,69 @@ class Along(Observer):
 
 
 def _first(table: tuple[Array, ...]) -> Array:
-    """The earliest of the crossings in each lane."""
+    """The earliest crossing in each lane."""
     return functools.reduce(jnp.minimum, [jnp.min(part, axis=0) for part in table])
 
 
 def _state_and_rate(osc: OwnOscillator, lanes: Lanes) -> tuple[Array, Array, Array]:
     """x1, x2 and x2' in the mode of the lanes, which slip; without derivatives."""
     osc, lanes = lax.stop_gradient((osc, lanes))
+    if has_clock(osc):
+        return lanes.x1, lanes.x2, _field(osc, lanes.mode, lanes.t, lanes.x1, lanes.x2)
     return lanes.x1, lanes.x2, mode_acceleration(osc, lanes.mode, lanes.x1, lanes.x2)
+
+
+def _field(osc: OwnOscillator, mode: Mode, t: Array, x1: Array, x2: Array) -> Array:
+    """x2' of an oscillator that knows the time; the mass that sticks goes with its belt."""
+    return field_at(osc, mode, (x1, x2, t))[1]
+
+
+def _told(function, osc: OwnOscillator, lanes: Lanes, x1: Array, x2: Array):
+    """A section's value and rate at a state of lanes."""
+    if not has_clock(osc):
+        return value_and_rate(function, osc, lanes.mode, x1, x2)
+    a = _field(osc, lanes.mode, lanes.t, x1, x2)
+    return value_and_rate(function, osc, lanes.mode, x1, x2, a)
 
 
 def _moved(osc: OwnOscillator, lanes: Lanes, delta: Array) -> tuple[Array, Array]:
     """The state that is `delta` away, by Taylor's formula of order 3 in x1 and 2 in x2."""
 
-    def field(x1, x2):
+    def field(x1, x2, *t):
+        if t:
+            return _field(osc, lanes.mode, *t, x1, x2)
         a = mode_acceleration(osc, lanes.mode, x1, x2)
         return jnp.where(lanes.mode.any_stuck, 0.0, a)
 
     x1, x2 = lanes.x1, lanes.x2
-    a = field(x1, x2)
-    _, jerk, *_ = jax.jvp(field, (x1, x2), (x2, a))
+    clock = (lanes.t,) if has_clock(osc) else ()
+    a = field(x1, x2, *clock)
+    ways = x2, a, *map(jnp.ones_like, clock)
+    _, jerk, *_ = jax.jvp(field, (x1, x2, *clock), ways)
     x1 = x1 + delta * (x2 + delta / 2 * (a + delta / 3 * jerk))
     return x1, x2 + delta * (a + delta / 2 * jerk)
 
 
 def _to_section(function, osc, lanes: Lanes, delta, low, high) -> Array:
-    """The way in time to a section, by a Newton step from `delta`, between two bounds.
+    """Time to a section, by a Newton step from `delta`, between two bounds.
 
     Its derivatives are those of the implicit function, whatever the bounds.
     """
     delta = lax.stop_gradient(delta)
-    value, rate = value_and_rate(function, osc, lanes.mode, *_moved(osc, lanes, delta))
+    later = replace(lanes, t=lanes.t + delta) if has_clock(osc) else lanes
+    value, rate = _told(function, osc, later, *_moved(osc, lanes, delta))
     step = -value / lax.stop_gradient(jnp.where(rate == 0, 1.0, rate))
     step = jnp.where(rate == 0, 0.0, step)
     return lax.stop_gradient(jnp.clip(delta + step, low, high) - step) + step
 
 
 def _next(times: tuple[float, ...], passed: Array) -> Array:
-    """The next of the fixed times; inf when all are past."""
+    """The next fixed time; inf when all are past."""
     return jnp.asarray((*times, np.inf))[jnp.minimum(passed, len(times))]
 
 
 def _forces(osc: OwnOscillator, mode: Mode, x2: Array, residual: Array) -> list[Array]:
-    """The friction force of each belt on the mass; stuck belts share what is needed by capacity."""
+    """Friction force of each belt on the mass; stuck belts share the holding force by capacity."""
     limits = [
         jnp.where(stuck, belt.load * belt.friction.static, 0.0)
         for belt, stuck in zip(osc.belts, mode.stuck, strict=True)

@@ -1,4 +1,4 @@
-"""The observer of attractors: where each run leads, found as early as it is certain."""
+"""The observer of attractors: what each run leads to, found as early as it is certain."""
 
 import functools
 from collections.abc import Mapping
@@ -20,28 +20,38 @@ from ..model.rest import is_neutral, settling_margin
 from ..model.transitions import begins_at_rest
 from ..results import Status
 
-#: What a run leads to, in the order of their codes.
+#: Kinds of attractors, in the order of their codes.
 KINDS = ("undecided", "equilibrium", "cycle", "stuck")
 UNDECIDED, EQUILIBRIUM, CYCLE, STUCK_FOR_EVER = range(4)
-#: What repeats, but is one of a continuum of closed orbits: undecided, in the end.
+#: Code of a closed orbit that is one of a continuum; it becomes undecided at the end.
 IN_CONTINUUM = len(KINDS)
 
 
 def signature(word: int, belts: int) -> str:
-    """The name of a cycle's signature; "none" at rest, "long" if no word holds it."""
+    """Name of a cycle's signature; "none" at rest, "long" if no word holds it."""
     if word < 1:
         return "none" if word == 0 else "long"
     return signature_name(word_events(word, belts))
 
 
 class _LoopSoFar(eqx.Module):
-    """The loop under way, since the mark: arrays [lanes].
+    """The present loop, since the mark: arrays [lanes].
 
-    x1_min, x1_max: extrema; sticks: time stuck to each belt; word: the events, see
-    `events.word_events`. tops: maxima of x1 since the last stick phase; previous: x1 at the last
-    one, change: how far that was from the one before. kind, period, transient, loop_events (how
-    many in one loop) are set when the attractor is found. previous_t: time of the last maximum;
-    wake: time before which nobody asks for maxima.
+    Attributes:
+        mark: State that later ones are compared with.
+        x1_min: Smallest x1.
+        x1_max: Largest x1.
+        sticks: Time stuck to each belt.
+        word: The events, see `events.word_events`.
+        tops: Number of maxima of x1 since the last stick phase.
+        previous: x1 at the last maximum.
+        previous_t: Time of the last maximum.
+        change: Difference of x1 at the last two maxima.
+        wake: Time before which steps do not end at maxima.
+        kind: Kind of the attractor, once found.
+        period: Its period, once found.
+        transient: Time at which it was found.
+        loop_events: Number of events in one loop.
     """
 
     mark: Mark
@@ -75,19 +85,19 @@ def _extended(osc: OwnOscillator, loop: _LoopSoFar, lanes: Lanes, passage: Passa
 
 
 class Attractor(Observer):
-    """Where the run leads; it ends as soon as that is known.
+    """What the run leads to; the run ends as soon as that is known.
 
-    - A cycle: an orbit that sticks repeats the end of a stick phase; from there it is a function of
-      the parameters alone, so it does so to the last bits. One that does not stick converges: its
-      top (a maximum of x1, where x2 = 0) repeats, see `settling`.
-    - An equilibrium: the run begins on one, or the orbit has entered a disc that is attracted by a
-      fixed point, see `rest.settling_margin`. A pseudo-focus is recognised by `is_captured`.
+    - A cycle that sticks repeats the state at the end of a stick phase; from there the orbit is a
+      function of the parameters alone, so it repeats to the last bits. A cycle that does not stick
+      is approached: its top (a maximum of x1, where x2 = 0) repeats, see `settling`.
+    - An equilibrium: the run begins on one, or the orbit has entered a disc that a fixed point
+      attracts, see `rest.settling_margin`. A pseudo-focus is recognised by `is_captured`.
     - Stuck for ever: on a belt at rest.
     - None of these: a closed orbit beside others, as around a centre, see `rest.is_neutral`. It
       attracts nothing, and the run ends undecided with the status NEUTRAL.
 
-    The signature of a cycle, (kind, belt) event by event, comes as a number, see `word_events`.
-    What a run tells of its attractor is NaN where it is undecided, and `sticks` false.
+    The signature of a cycle, (kind, belt) event by event, is a number, see `word_events`. The
+    variables of the attractor are NaN where it is undecided, and `sticks` is false.
     """
 
     variables: ClassVar[Mapping[str, Variable]] = {
@@ -103,23 +113,24 @@ class Attractor(Observer):
         "transient": Variable("time at which the attractor was reached"),
         "n_events": Variable("number of events (of a cycle: in one loop)", "int32"),
     }
-    #: Distance to the last state at the end of a stick phase, which repeats up to rounding, over
-    #: the amplitude.
+    #: Distance to the last state at the end of a stick phase, over the amplitude, up to which both
+    #: count as equal; only rounding separates them.
     EXACT: ClassVar[float] = 1e-9
-    #: A top that moved by fewer tolerances than this, over the amplitude, moves by rounding alone.
+    #: A top that moves by less than so many tolerances, over the amplitude, moves by rounding
+    #: alone.
     STANDS: ClassVar[float] = 30.0
     #: Motion that is smaller than so many tolerances comes from the integrator.
     RESOLVED: ClassVar[float] = 1e3
     #: Time before which steps do not end at extrema, unless a stick phase has ended: about two
     #: loops, which are transient in nearly every run.
     SETTLING: ClassVar[float] = 12.0
-    #: Tops spiral slowly where each moves by about what the last one did, by a factor of these, and
-    #: by more than that part of the amplitude: 40 more are needed until they repeat.
+    #: A spiral is slow if each move of the top is about the last one times a factor between these,
+    #: and larger than FAR times the amplitude: it takes 40 more until tops repeat.
     SLOW: ClassVar[tuple[float, float]] = (0.8, 1.25)
     FAR: ClassVar[float] = 1e-3
     #: Loops of a slow spiral in which steps do not end at tops.
     ASLEEP: ClassVar[int] = 16
-    #: Tops without a stick phase after which a run is taken to stick no more.
+    #: Number of tops without a stick phase after which a run counts as one that no longer sticks.
     SMOOTH: ClassVar[int] = 2
 
     def extrema(self, lanes):
@@ -165,7 +176,8 @@ class Attractor(Observer):
         mark = loop.mark
         slow = self._is_slow(loop, change, seen)
         sleeps = materialise(top & (tops > self.SMOOTH) & ~found & slow, ones)
-        # Where it comes back and has not settled, the next loop is compared with this one.
+        # Where the orbit comes back and is not yet settled, the next loop is compared with this
+        # one.
         renewed, new = mark.renewed(lanes, section & ~found, lanes.events, ones, met)
         # An attractor at rest is a point; a new mark begins a new loop.
         fresh = new | resting
@@ -189,7 +201,7 @@ class Attractor(Observer):
             transient=jnp.where(found, jnp.where(resting, passage.t, mark.t), loop.transient),
             loop_events=jnp.where(cycle, lanes.events - mark.count, loop.loop_events),
         )
-        # Lanes that are decided keep what they found until it is handed in.
+        # Decided lanes keep their results until these are collected.
         memory = select(loop.kind == UNDECIDED, memory, loop)
         return replace(
             lanes,
@@ -200,7 +212,7 @@ class Attractor(Observer):
         )
 
     def _is_slow(self, loop: _LoopSoFar, change, seen: _LoopSoFar) -> Array:
-        """Whether tops move as in a slow spiral, so that they cannot settle soon."""
+        """Whether tops move as in a slow spiral, so that they cannot repeat soon."""
         way, before, (least, most) = jnp.abs(change), jnp.abs(loop.change), self.SLOW
         alike = (change * loop.change > 0) & (way > least * before) & (way < most * before)
         return alike & (way > self.FAR * (seen.x1_max - seen.x1_min))
@@ -208,7 +220,7 @@ class Attractor(Observer):
     def _kind(
         self, loop: _LoopSoFar, lanes, passage, section, released, change, tol
     ) -> tuple[Array, Array]:
-        """Whether the lanes are back at their marks, and what they are found to lead to.
+        """Whether the lanes are back at their marks, and the kind that they lead to.
 
         section: lanes in a state to compare with marks; released: those at the end of a stick
         phase; change: of x1 since the last top.
@@ -216,7 +228,7 @@ class Attractor(Observer):
         amplitude = loop.x1_max - loop.x1_min
         left = way_left(change, loop.change)
         moved, close = jnp.abs(lanes.x1 - loop.mark.x1), amplitude * REPEATED
-        # Below the tolerance, too, a top may be on its way, as in every loop a little less.
+        # A top may drift with moves below the tolerance, each a little smaller than the last one.
         on_its_way = (change * loop.change > 0) & (moved * left < amplitude)
         stands = (moved < self.STANDS * tol * amplitude) & ~on_its_way
         # The moves of a slow spiral around a pseudo-focus shrink like the square of its size.
@@ -256,7 +268,7 @@ class Attractor(Observer):
             lanes,
             lower=jnp.where(found, 0.0, lanes.lower),
             upper=jnp.where(found, 0.0, lanes.upper),
-            # What stands there to rounding would do so until t1: it stays undecided.
+            # An orbit that stays there up to rounding would do so until t1: it remains undecided.
             done=lanes.done | found | (lost & slips),
             memory=memory,
         )
@@ -271,7 +283,7 @@ class Attractor(Observer):
         word = jnp.where(jnp.isinf(loop.word), -1.0, loop.word)
 
         def of_attractor(value):
-            """NaN where there is none: the loop that an undecided run was in is none."""
+            """NaN where there is no attractor: the loop of an undecided run is none."""
             return jnp.where(undecided, jnp.nan, value)
 
         return {

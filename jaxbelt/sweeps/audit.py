@@ -1,9 +1,9 @@
-"""Audits of sweeps: some runs once more the long way, without any shortcut, and compared.
+"""Audits of sweeps: some runs again without any shortcut, and compared.
 
-The kernel of `queue` takes three: a run of final states skips the loops that it has seen repeat; a
-run that looks for its attractor ends as soon as it knows it; and a run that is captured by a
-pseudo-focus ends at rest there. The long way takes none of them to t1. From the state at t1 the
-attractor is then looked for again: it has to be the same one.
+The kernel of `queue` has three shortcuts: a run of final states skips loops once it has seen one
+repeat; a run that looks for its attractor ends as soon as it knows it; and a run that is captured
+by a pseudo-focus ends at rest there. The audited runs take none of them and go to t1. From the
+state at t1 the attractor is then looked for again: it has to be the same one.
 """
 
 import dataclasses
@@ -24,16 +24,16 @@ from .observers import Final
 from .queue import by_name, layout
 from .threads import CHUNK, run
 
-#: States and extrema may differ by so many times the tolerance of a step: errors add up over a run.
+#: Largest difference of states and extrema, in tolerances of a step: errors add up over a run.
 AUDIT_CLOSE = 1e4
-#: Share of the usual budget of steps on the long way, where no pseudo-focus ends a run.
+#: Share of the usual budget of steps for audited runs, which no pseudo-focus ends.
 LONG_WAY_BUDGET = 0.025
 
 Results = dict[str, np.ndarray]
 
 
 def chosen(runs: int, share: float) -> np.ndarray:
-    """The numbers of the runs that are audited: the same ones for the same sweep."""
+    """Numbers of the runs that are audited: the same ones for the same sweep."""
     count = math.ceil(share * runs)
     return np.sort(np.random.default_rng(runs).choice(runs, count, replace=False))
 
@@ -47,11 +47,11 @@ def differing(
     numbers: dict[str, Any],
     length: float,
 ) -> np.ndarray:
-    """The numbers of the audited runs of which the long way says otherwise.
+    """Numbers of the audited runs that differ without shortcuts.
 
-    rows_of(runs): the kernel's rows of some runs, [columns, runs]; known: what the sweep says of
-    the audited ones, a row each, in the form of the kernel's results; length: the own unit of
-    length of the oscillators.
+    rows_of(runs): the kernel's rows of some runs, [columns, runs]; known: results of the sweep for
+    the audited runs, a row each, in the form of the kernel's results; length: own unit of length of
+    the oscillators.
     """
     atol = numbers["rtol"] * length if numbers["atol"] is None else numbers["atol"]
     close = functools.partial(_close, atol=atol, rtol=numbers["rtol"])
@@ -105,7 +105,7 @@ def _same_ends(known: Results, final: Results, close: Callable, captured: Callab
 
 
 def _captured(x1: np.ndarray, known: Results, final: Results, *, within: float) -> np.ndarray:
-    """Whether a run that was ended by a pseudo-focus at x1 has not left it on the long way."""
+    """Whether a run that a pseudo-focus at x1 ended stays there without the shortcut."""
     distance = np.hypot(final["x1_end"] - x1, final["x2_end"])
     return (known["status"] == Status.PSEUDO_FOCUS) & (distance <= within)
 
@@ -113,7 +113,7 @@ def _captured(x1: np.ndarray, known: Results, final: Results, *, within: float) 
 def _same_attractors(
     known: Results, final: Results, again: Results, close: Callable, captured: Callable
 ) -> np.ndarray:
-    """Whether attractors agree, each with its place. What is undecided claims nothing."""
+    """Whether attractors agree, each with its place. Undecided ones claim nothing."""
     decided = (known["kind"] != UNDECIDED) & (again["kind"] != UNDECIDED)
     same = known["kind"] == again["kind"]
     for name in ("x1_min", "x1_max", "x2_min", "x2_max"):

@@ -1,12 +1,11 @@
 """Basins of attraction: which starts lead where, as a picture and as a number.
 
-`basins` labels a grid of starts by the attractor that each leads to, and finds the unstable cycle
-that separates them, where there is one. `basin_stability` gives the fraction of a box of starts
-that leads to each kind of attractor, with its standard error (P. J. Menck, J. Heitzig, N. Marwan,
-J. Kurths, How basin stability complements the linear-stability paradigm, Nature Physics 9 (2013)
-89-92). Of labelled grids there are measures: their entropy, and how many starts are near to their
-attractor at some time. All run in the kernel behind `sweep`, where a run ends as soon as its
-attractor is known.
+`basins` labels a grid of starts by their attractors, and finds the unstable cycle that separates
+them, where there is one. `basin_stability` returns the fraction of a box of starts that leads to
+each kind of attractor, with its standard error (P. J. Menck, J. Heitzig, N. Marwan, J. Kurths, How
+basin stability complements the linear-stability paradigm, Nature Physics 9 (2013) 89-92). Measures
+of labelled grids are their entropy, and the fraction of starts that are near to their attractor at
+some time. All use the kernel behind `sweep`, where a run ends as soon as its attractor is known.
 """
 
 import math
@@ -37,8 +36,9 @@ from ..cycles.cycle import Cycle, cycle_from
 from ..cycles.unstable import from_starts, unstable_cycle
 from ..kernel.lanes import Program
 from ..model.equilibria import EquilibriumKind, equilibria
-from ..model.oscillator import Oscillator, check_oscillator
+from ..model.oscillator import Oscillator, check_oscillator, refuse_clock
 from ..model.own_units import in_given_units, in_own_units, in_units_of_run
+from ..numerics.compiling import compiled_beside
 from ..results import Status, draw
 from ..tables import table_of
 from .attractor import KINDS, Attractor
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     import xarray
 
 
-#: What the table of basins tells of cycles, in numbers.
+#: Columns of the table of basins that only cycles have.
 OF_CYCLES = ("x1_min", "x1_max", "x2_min", "x2_max", "period", "multiplier")
 
 
@@ -64,13 +64,16 @@ class BasinEntropy(NamedTuple):
 
 
 class Basins(eqx.Module):
-    """What `basins` returns.
+    """A grid of starts, labelled by attractors; what `basins` returns.
 
-    oscillator: whose basins these are; dataset: `xarray.Dataset` over x1 and x2 with everything
-    that `sweep(..., observe="attractor")` tells of each start, and `label`, the number of its
-    attractor, from 0, the most frequent first (-1: undecided); attractors: a few words for each
-    label; cycles: those of the attractors that are cycles, in the same order; boundary: the
-    unstable cycle, with the status NO_UNSTABLE_CYCLE where there is none.
+    Attributes:
+        oscillator: The oscillator.
+        dataset: `xarray.Dataset` over x1 and x2 with all variables of `sweep(...,
+            observe="attractor")`, and `label`, the number of the attractor, from 0, the most
+            frequent first (-1: undecided).
+        attractors: A few words for each label.
+        cycles: Those of the attractors that are cycles, in the same order.
+        boundary: The unstable cycle, with the status NO_UNSTABLE_CYCLE where there is none.
     """
 
     oscillator: Oscillator
@@ -81,20 +84,29 @@ class Basins(eqx.Module):
 
     @property
     def label(self) -> "xarray.DataArray":
+        """Number of the attractor of each start, -1 for undecided ones."""
         return self.dataset["label"]
 
     def entropy(self, side: int | tuple[int, int]) -> BasinEntropy:
-        """The basin entropy S_b, `.basins`, and the boundary basin entropy S_bb, `.boundary`: how
-        little a start that is known to a box tells of where it leads.
+        """Basin entropy: how little a start that is known to a box says about its attractor.
 
-        side: of the boxes that the grid is cut into, in starts, along x1 and x2 alike or (along x1,
-        along x2); it has to divide the numbers of starts. In a box in which the shares p_j of the
-        starts lead to the attractors j the entropy is -sum p_j log p_j, natural logarithms; S_b is
-        its mean over all boxes, S_bb over those that have more than one label, NaN where none has.
+        In a box in which the shares p_j of the starts lead to the attractors j the entropy is -sum
+        p_j log p_j, with natural logarithms. The basin entropy S_b is its mean over all boxes, the
+        boundary basin entropy S_bb over those with more than one label (NaN where there is none).
         Undecided starts count as one more attractor. Both depend on the size of the boxes: compare
         at one size. A boundary with S_bb > log 2 is fractal (A. Daza, A. Wagemakers, B. Georgeot,
         D. Guery-Odelin, M. A. F. Sanjuan, Basin entropy: a new tool to analyze uncertainty in
-        dynamical systems, Scientific Reports 6 (2016) 31416). `ValueError` for an impossible side.
+        dynamical systems, Scientific Reports 6 (2016) 31416).
+
+        Args:
+            side: Side of the boxes into which the grid is cut, in starts, along x1 and x2 alike or
+                (along x1, along x2); it has to divide the numbers of starts.
+
+        Returns:
+            A tuple with S_b, `.basins`, and S_bb, `.boundary`.
+
+        Raises:
+            ValueError: If the side is impossible.
         """
         sides = side if isinstance(side, tuple) and len(side) == 2 else (side, side)
         across, along = (as_whole(one, "side") for one in sides)
@@ -114,15 +126,24 @@ class Basins(eqx.Module):
 
     @announced("finite_time_stability")
     def finite_time_stability(self, t: ArrayLike, within: ArrayLike) -> np.ndarray:
-        """The finite-time basin stability of each attractor, [attractors]: the fraction of all
-        starts that lead to it and are near to it at time t.
+        """Finite-time basin stability of each attractor.
 
-        t: time since the start; within: how near, the largest distance between the states (x1, x2)
-        of the run at that time and of the attractor that is nearest to it; dimensionless. For long
-        times it is the fraction that leads there at all (P. Schultz, F. Hellmann, K. N. Webster,
+        It is the fraction of all starts that lead to the attractor and are near to it at time t;
+        for long times the fraction that leads there at all (P. Schultz, F. Hellmann, K. N. Webster,
         J. Kurths, Bounding the first exit from the basin: Independence times and finite-time basin
         stability, Chaos 28 (2018) 043102). A run that was near before and is not at time t does not
-        count. NaN of a cycle that shooting did not find. `ValueError` for what is not positive.
+        count.
+
+        Args:
+            t: Time since the start, dimensionless.
+            within: Largest distance of the state (x1, x2) at that time from the nearest state of
+                the attractor, dimensionless.
+
+        Returns:
+            The fractions, [attractors]; NaN for a cycle that shooting did not find.
+
+        Raises:
+            ValueError: If an argument is not positive.
         """
         t, within = as_positive(t, "t"), as_positive(within, "within")
         settings = {name: self.dataset.attrs.get(name) for name in ("rtol", "atol")}
@@ -146,10 +167,13 @@ class Basins(eqx.Module):
         return np.array(found)
 
     def table(self) -> "pandas.DataFrame":
-        """A row for each attractor, and one for undecided starts: label, attractor (its words),
-        fraction of the starts, and of a cycle x1_min, x1_max, x2_min, x2_max, period, multiplier
-        and signature; last the unstable cycle, label -2, where there is one. Every start by itself
-        is in `basins.dataset.to_dataframe()`."""
+        """Returns a row for each attractor, and one for undecided starts.
+
+        Columns: label, attractor (its words), fraction of the starts, and for a cycle x1_min,
+        x1_max, x2_min, x2_max, period, multiplier and signature. The last row is the unstable
+        cycle, label -2, where there is one. `basins.dataset.to_dataframe()` has a row for every
+        start.
+        """
         labels, cycles = np.asarray(self.label), iter(self.cycles)
         rows = []
         for number, name in enumerate(self.attractors):
@@ -172,8 +196,14 @@ class Basins(eqx.Module):
         )
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw which start leads where, with the cycles, into the axes `ax` (None: new ones), which
-        are returned, and a key below them: the picture of `plot_basins`."""
+        """Draws which start leads where, with the cycles and a key: the picture of `plot_basins`.
+
+        Args:
+            ax: Axes; None makes new ones.
+
+        Returns:
+            The axes.
+        """
         return draw(self, ax)
 
     def __repr__(self) -> str:
@@ -184,12 +214,12 @@ class Basins(eqx.Module):
         return f"Basins({labels.shape[0]} x {labels.shape[1]} starts: {', '.join(parts)})"
 
 
-#: States of a cycle, between which it is taken for straight.
+#: States of a cycle that are joined by straight lines.
 CHORDS = 4000
 
 
 def _away_from_cycle(cycle: Cycle, states: np.ndarray) -> np.ndarray:
-    """Distances of states, [n, 2], from a cycle, [n]; NaN where it is none."""
+    """Distances of states, [n, 2], from a cycle, [n]; NaN where there is no cycle."""
     from scipy.spatial import KDTree  # late, as only this needs it
 
     if int(cycle.status) != Status.OK:
@@ -209,11 +239,15 @@ def _away_from_cycle(cycle: Cycle, states: np.ndarray) -> np.ndarray:
 
 
 class BasinStability(eqx.Module):
-    """What `basin_stability` returns: fractions of the starts, and their standard errors.
+    """Fractions of the starts by kind of attractor; what `basin_stability` returns.
 
-    fractions, standard_errors: dictionaries with the keys "equilibrium", "cycle", "stuck" and
-    "undecided". n: number of starts. The standard error of 0 and of 1 is 0; what was met by none of
-    the n starts has a fraction below 3/n, with a confidence of 95 per cent.
+    The standard error of a fraction 0 or 1 is 0; a kind that none of the n starts met has a
+    fraction below 3/n, with a confidence of 95 per cent.
+
+    Attributes:
+        fractions: Dictionary with the keys "equilibrium", "cycle", "stuck" and "undecided".
+        standard_errors: Standard errors, with the same keys.
+        n: Number of starts.
     """
 
     fractions: dict[str, float]
@@ -221,7 +255,7 @@ class BasinStability(eqx.Module):
     n: int
 
     def table(self) -> "pandas.DataFrame":
-        """A row for each kind: kind, fraction, standard_error, n."""
+        """Returns a row for each kind; columns: kind, fraction, standard_error, n."""
         return table_of(
             {
                 "kind": list(self.fractions),
@@ -232,8 +266,14 @@ class BasinStability(eqx.Module):
         )
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw the fractions as bars, with their standard errors, into the axes `ax` (None: new
-        ones), which are returned."""
+        """Draws the fractions as bars, with their standard errors.
+
+        Args:
+            ax: Axes; None makes new ones.
+
+        Returns:
+            The axes.
+        """
         return draw(self, ax)
 
     def __repr__(self) -> str:
@@ -242,7 +282,7 @@ class BasinStability(eqx.Module):
             for kind, fraction in self.fractions.items()
             if 0 < fraction < 1
         ]
-        # All starts agree: the standard error is 0, and tells nothing of the others.
+        # If all starts agree, the standard error is 0 and says nothing about other kinds.
         parts += [
             f"all {kind}, a fraction above {max(0.0, 1 - 3 / self.n):.5f} with 95% confidence"
             for kind, fraction in self.fractions.items()
@@ -262,28 +302,44 @@ def basins(
     atol: float | None = None,
     progress: bool | None = None,
 ) -> Basins:
-    """A grid of starts, labelled by where each leads, and the unstable cycle between them.
+    """Labels a grid of starts by their attractors, and finds the unstable cycle between them.
 
-    x1, x2: displacements and velocities of the starts, increasing, [n] and [m], dimensionless. t1:
-    when a run that reached no attractor is given up. rtol, atol: as in `sweep`. progress:
-    whether to show how far it is, as in `sweep`. `ValueError` names an argument that is impossible.
+    Args:
+        oscillator: The oscillator.
+        x1: Displacements of the starts, increasing, [n], dimensionless.
+        x2: Velocities of the starts, increasing, [m], dimensionless.
+        t1: Time at which a run that has reached no attractor is given up.
+        rtol: Relative tolerance of a step, as in `sweep`.
+        atol: Absolute tolerance of a step, as in `sweep`.
+        progress: Whether to show a bar, as in `sweep`.
+
+    Returns:
+        The `Basins`.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(oscillator, "oscillator")
+    refuse_clock(oscillator, "basins", 'jb.sweep with axes x1 and x2 and observe="attractor"')
     axes = {name: _starts_along(values, name) for name, values in (("x1", x1), ("x2", x2))}
     require_wish(progress, "progress")
     with Activity("basins", progress):
-        dataset = sweep(
-            lambda: oscillator,
-            axes,
-            t1=t1,
-            rtol=rtol,
-            atol=atol,
-            observe="attractor",
-        )
+        own = in_own_units(oscillator)
+        start = jnp.asarray(np.zeros(2))
+        ahead = [lambda: cycle_from(own, start), lambda: from_starts(own)]
+        with compiled_beside("basins", own, ahead):
+            dataset = sweep(
+                lambda: oscillator,
+                axes,
+                t1=t1,
+                rtol=rtol,
+                atol=atol,
+                observe="attractor",
+            )
         note_progress("telling the attractors apart")
         labels, attractors, cycles = _labels(oscillator, dataset)
-        # With one attractor there is hardly one, and to look among all cycles takes its time.
-        own = in_own_units(oscillator)
+        # With one attractor there is hardly an unstable cycle, and a search among all cycles takes
+        # time.
         boundary = (unstable_cycle if len(attractors) > 1 else from_starts)(own)
         boundary = in_given_units(boundary, oscillator, own)
     dataset["label"] = (
@@ -301,7 +357,7 @@ def basins(
 
 
 def _starts_along(values: Any, name: str) -> np.ndarray:
-    """The starts along one axis, or a `ValueError`."""
+    """Checks the starts along one axis."""
     refuse_interval(values, name)
     along = np.asarray(as_array(values, name, (None,)))
     check_finite(along, name)
@@ -313,7 +369,8 @@ def _starts_along(values: Any, name: str) -> np.ndarray:
 def _labels(
     osc: Oscillator, dataset: "xarray.Dataset"
 ) -> tuple[np.ndarray, tuple[str, ...], tuple[Cycle, ...]]:
-    """Numbers of the attractors, the most frequent first, names, and those that are cycles."""
+    """Numbers of the attractors, the most frequent first, their names, and those that are
+    cycles."""
     kinds = np.asarray(decoded(dataset[["kind"]])["kind"])
     sticks = np.asarray(dataset["sticks"]).astype(bool)
     low, high = np.asarray(dataset["x1_min"]), np.asarray(dataset["x1_max"])
@@ -321,22 +378,22 @@ def _labels(
     runs = Runs.of(dataset, ("x1", "x2"))
     own, length = in_own_units(osc, np.asarray(dataset.attrs["length"])), dataset.attrs["length"]
     found: list[_Found] = []
-    left = kinds != "undecided"
-    while np.any(left):
-        first = tuple(int(i) for i in np.unravel_index(np.argmax(left), left.shape))
+    unlabelled = kinds != "undecided"
+    while np.any(unlabelled):
+        first = tuple(int(i) for i in np.unravel_index(np.argmax(unlabelled), unlabelled.shape))
         kind, stuck = kinds[first], sticks[first]
-        same, cycle, before = left & (kinds == kind), None, None
+        same, cycle, before = unlabelled & (kinds == kind), None, None
         if kind == "cycle":
             start = np.array([dataset.x1[first[0]], dataset.x2[first[1]]]) / length
             cycle = cycle_from(own, jnp.asarray(start))
-            # Runs that differ by what a sweep does not tell exactly may still be of one cycle.
+            # Runs that differ more than the accuracy of a sweep may still be on one cycle.
             before = next((one for one in found if one.is_of(cycle)), None)
             same &= runs.same(runs.at(first))[0]
         else:
-            # A mass that is stuck for ever may be so anywhere on a segment.
+            # A mass that is stuck for ever may be anywhere on a segment.
             place = rest if kind == "equilibrium" else held
             same &= np.all(sticks == stuck, axis=-1) & (place == place[first])
-        left &= ~same
+        unlabelled &= ~same
         if before is None:
             found.append(_Found(_words_for(kind, stuck, rest[first], length), same, cycle))
         else:
@@ -350,7 +407,8 @@ def _labels(
 
 
 class _Found(NamedTuple):
-    """Its name, which runs lead to it, and, of a cycle, what shooting finds from one of them."""
+    """An attractor: its name, the runs that lead to it, and the cycle that shooting finds, if it
+    is one."""
 
     name: str
     runs: np.ndarray
@@ -361,16 +419,19 @@ class _Found(NamedTuple):
         return self.cycle is not None and is_same(self.cycle, cycle)
 
 
-#: Runs end no further from the equilibrium that captures them, in own units.
+#: Runs end no farther from the equilibrium that captures them, in own units.
 NEAR_REST = 1e-2
 
 
 def rest_reached(osc: Oscillator, x1: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of an equilibrium that each may have come to: its x1, and the number of its segment; and the
-    ends of all segments, [segments, 2].
+    """Equilibria that runs have come to.
 
-    A run ends near the equilibrium; where none is near, it is told where the run is. A segment
+    A run ends near its equilibrium; where none is near, x1 of the run itself is returned. A segment
     across an edge is in pieces.
+
+    Returns:
+        x1 of the equilibria, the numbers of their segments, and the ends of all segments,
+        [segments, 2].
     """
     own = in_own_units(osc)
     length = 1.0 if own is osc else float(own.units.length)
@@ -416,13 +477,29 @@ def basin_stability(
     rtol: float = 1e-8,
     atol: float | None = None,
 ) -> BasinStability:
-    """The fraction of a box of starts that leads to each kind of attractor.
+    """Fraction of a box of starts that leads to each kind of attractor.
 
-    box: ((x1 from, to), (x2 from, to)), dimensionless; n: number of starts, drawn uniformly; key:
-    from `jax.random.key`; t1, rtol, atol as in `basins`. The standard error of a fraction f is
-    sqrt(f (1 - f) / n). `ValueError` names an argument that is impossible.
+    The standard error of a fraction f is sqrt(f (1 - f) / n).
+
+    Args:
+        oscillator: The oscillator.
+        box: ((x1 from, to), (x2 from, to)), dimensionless.
+        n: Number of starts, drawn uniformly.
+        key: Random key, from `jax.random.key`.
+        t1: Time at which a run that has reached no attractor is given up.
+        rtol: Relative tolerance of a step, as in `sweep`.
+        atol: Absolute tolerance of a step, as in `sweep`.
+
+    Returns:
+        The `BasinStability`.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(oscillator, "oscillator")
+    refuse_clock(
+        oscillator, "basin_stability", 'jb.sweep with axes x1 and x2 and observe="attractor"'
+    )
     corners, n = as_box(box), as_whole(n, "n")
     check_key(key)
     numbers = settings_of_runs(t1, rtol, atol)
@@ -433,12 +510,12 @@ def basin_stability(
 
 
 def standard_error(fraction: Any, n: int) -> Any:
-    """Of fractions of n starts."""
+    """Standard error of fractions of n starts."""
     return np.asarray(np.sqrt(np.clip(fraction * (1 - np.asarray(fraction)), 0, None) / n))
 
 
 def as_box(box: Any) -> np.ndarray:
-    """The corners of a box of starts, [2, 2], x1 and x2 from and to, or a `ValueError`."""
+    """Corners of a box of starts, [2, 2], x1 and x2 from and to, or a `ValueError`."""
     require_value(np.shape(box) == (2, 2), "box", "((x1 from, to), (x2 from, to))", box)
     return np.array([as_interval(ends, f"box[{i}], x{i + 1}") for i, ends in enumerate(box)])
 
@@ -450,7 +527,7 @@ def starts_in(corners: np.ndarray, n: int, key: Array) -> np.ndarray:
 
 
 def check_key(key: Any) -> None:
-    """Raise unless it is a key of JAX, of either sort."""
+    """Raises a `ValueError` unless it is a key of JAX, of either sort."""
     dtype, shape = getattr(key, "dtype", np.dtype(object)), np.shape(key)
     typed = jnp.issubdtype(dtype, jax.dtypes.prng_key) and shape == ()
     raw = dtype == np.uint32 and shape == (2,)

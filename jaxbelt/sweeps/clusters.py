@@ -2,7 +2,7 @@
 
 A task is one block. It looks into the ledger, does the block if it is not done, writes its chunks
 and then its row of the ledger, and returns a small dictionary. So it may run twice, on any worker:
-when a worker dies, its block is done again elsewhere, to the same bits. The client holds the lock
+when a worker dies, its block is done again elsewhere, with the same bits. The client holds the lock
 of the store and numbers the categories when all blocks are done.
 
 `distributed` is imported here only, and where it is used.
@@ -23,27 +23,27 @@ from ..checks import require_value
 from ..numerics.widths import is_cpu
 from .question import Question
 from .store import Store
-from .work import Tell, counts, do_runs
+from .work import Advance, counts, do_runs
 
-#: How often a block is done again whose task raised, on a full disk, say.
+#: How often a block is repeated whose task raised, for example because a disk was full.
 RETRIES = 2
 #: How often a block is submitted again that Dask gave up, because several workers died with it.
 RESUBMISSIONS = 3
-#: The resource of workers by this name; where there are such, blocks go to no others.
+#: Resource of workers by this name; where workers have it, blocks go to no others.
 GPU = "GPU"
 
 
 def check_executor(executor: Any) -> None:
-    """Raise unless it is a client that can be waited for."""
+    """Raises unless it is a client that can be waited for."""
     methods = ("submit", "scheduler_info", "cancel", "asynchronous")
     fits = all(hasattr(executor, name) for name in methods) and not executor.asynchronous
     require_value(fits, "executor", "a dask.distributed.Client (not asynchronous)", executor)
 
 
-def do_on_cluster(client: Any, question: Question, store: Store, tell: Tell) -> None:
-    """Do the blocks that the store lacks on the workers of a cluster.
+def do_on_cluster(client: Any, question: Question, store: Store, advance: Advance) -> None:
+    """Does the blocks that the store lacks on the workers of a cluster.
 
-    tell takes how many more runs ended with each status. Workers may come and go.
+    advance is called with the numbers of further runs by status. Workers may come and go.
     """
     import cloudpickle
     from distributed import KilledWorker, as_completed
@@ -64,7 +64,7 @@ def do_on_cluster(client: Any, question: Question, store: Store, tell: Tell) -> 
         for future in done:
             block = futures.pop(future)
             try:
-                told = future.result()
+                outcome = future.result()
             except KilledWorker:
                 if submitted[block] > RESUBMISSIONS:
                     raise
@@ -72,26 +72,27 @@ def do_on_cluster(client: Any, question: Question, store: Store, tell: Tell) -> 
                 futures[again] = block
                 done.add(again)
                 continue
-            store.look(block)
+            store.read_rows(block)
             if not store.is_done(block):
                 raise OSError(f"store {store.path} must be in a folder that all workers share")
-            tell(told["statuses"])
+            advance(outcome["statuses"])
     finally:
         client.cancel(list(futures))
-        store.look(*store.to_do)
+        store.read_rows(*store.to_do)
 
 
 def _resources(client: Any) -> dict[str, float] | None:
-    """What a block needs. All blocks run on one kind of device, for another rounds otherwise."""
+    """Resources that a block needs. All blocks run on one kind of device, as others round
+    differently."""
     workers = client.scheduler_info(n_workers=-1)["workers"].values()
     return {GPU: 1.0} if any(worker["resources"].get(GPU, 0) for worker in workers) else None
 
 
 def do_block(packed: bytes, place: str, block: int) -> dict[str, Any]:
-    """Do a block of a store unless it is done; the task of a worker.
+    """Does a block of a store unless it is done; the task of a worker.
 
     packed: the arguments of the sweep and the hash of the question, pickled; place: the store's
-    folder. Returns the block and how many of its runs ended with each status.
+    folder. Returns the block and the numbers of its runs by status.
     """
     stopped = _stopped()
 
@@ -99,10 +100,10 @@ def do_block(packed: bytes, place: str, block: int) -> dict[str, Any]:
         if stopped():
             raise RuntimeError("the sweep was interrupted")
 
-    # For this thread of the worker, whatever else the worker does.
+    # For this thread of the worker only.
     with jax.enable_x64(True):
         question, store = _opened(packed, place)
-        store.look(block)
+        store.read_rows(block)
         if not store.is_done(block):
             store.began = time.monotonic()
             threads = 1 if is_cpu() else None
@@ -112,14 +113,15 @@ def do_block(packed: bytes, place: str, block: int) -> dict[str, Any]:
 
 @functools.lru_cache(maxsize=4)
 def _opened(packed: bytes, place: str) -> tuple[Question, Store]:
-    """The question and its store, once a worker: the kernel is compiled for this very question."""
+    """The question and its store, once for each worker: the kernel is compiled for this
+    question."""
     arguments, known = pickle.loads(packed)
     question = Question.of(*arguments)
     return question, Store(Path(place), question, known=known)
 
 
 def _stopped() -> Callable[[], bool]:
-    """Whether the task that asks is wanted no more."""
+    """Returns a function that says whether the present task is cancelled."""
     from distributed import get_worker
 
     try:

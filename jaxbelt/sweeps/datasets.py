@@ -1,7 +1,7 @@
 """Datasets of sweeps: variables with names, units and meanings, and the results in memory.
 
-A category is an integer; the attributes `flag_values` and `flag_meanings` of the CF conventions say
-what it stands for, and `decoded` puts the words in its place.
+A category is an integer; its meaning is in the attributes `flag_values` and `flag_meanings` of the
+CF conventions, and `decoded` puts the words in its place.
 """
 
 from collections.abc import Iterable, Mapping
@@ -18,7 +18,7 @@ from .queue import by_name, layout
 if TYPE_CHECKING:
     import xarray
 
-#: What axes are called in words; other arguments of `make` go by their own name.
+#: Words for axes; other arguments of `make` go by their own name.
 AXIS_NAMES = {
     "nu0": "velocity of belt 0",
     "nu1": "velocity of belt 1",
@@ -34,20 +34,28 @@ STATUS = Variable(
     "int8",
     meanings={status.value: status.name.lower() for status in Status},
 )
-#: Status of runs that are yet to be done, and the word for them in every category.
+#: Status of runs that are not done yet, and the word for them in every category.
 NOT_RUN = -1
 NOT_DONE = "not_done"
-#: Names that a store has for things of its own.
+#: Names that a store needs for its own arrays.
 TAKEN = ("ledger",)
 
 
 def decoded(dataset: "xarray.Dataset") -> "xarray.Dataset":
-    """The dataset with words for the integers of its categories.
+    """Replaces the integers of categories by words.
 
-    dataset: of `sweep`, or `Basins.dataset`, also as read from a file. Every variable with the
-    attributes `flag_values` and `flag_meanings` becomes one of strings, so that
-    `decoded(dataset).kind == "cycle"` is what it says; what has no meaning becomes "". In a store
-    whose sweep is not finished, runs that are yet to be done are "not_done".
+    Every variable with the attributes `flag_values` and `flag_meanings` becomes one of strings, so
+    that `decoded(dataset).kind == "cycle"` works as it reads. An integer without a meaning becomes
+    ""; in a store whose sweep is not finished, runs that are not done are "not_done".
+
+    Args:
+        dataset: From `sweep`, or `Basins.dataset`, also as read from a file.
+
+    Returns:
+        The dataset with words.
+
+    Raises:
+        ValueError: If it is no dataset.
     """
     check_dataset(dataset)
     return dataset.assign(
@@ -60,13 +68,13 @@ def decoded(dataset: "xarray.Dataset") -> "xarray.Dataset":
 
 
 def check_dataset(dataset: Any) -> None:
-    """Raise unless it is an `xarray.Dataset`, or passes for one."""
+    """Raises unless it is an `xarray.Dataset`, or behaves like one."""
     fits = all(hasattr(dataset, name) for name in ("data_vars", "dims", "assign"))
     require_value(fits, "dataset", "an xarray.Dataset, such as sweep(...) returns", dataset)
 
 
 def words_of(values: np.ndarray, attributes: dict[str, Any]) -> np.ndarray:
-    """The words that the values of a category stand for."""
+    """Words that the values of a category stand for."""
     numbers = np.atleast_1d(attributes["flag_values"])
     words = np.array(["", *attributes["flag_meanings"].split()])
     order = np.argsort(numbers)
@@ -83,15 +91,15 @@ def flags(meanings: Mapping[int, str], dtype: str) -> dict[str, Any]:
 
 
 def _not_done(meanings: Mapping[int, str]) -> int:
-    """The value of a category in runs that are yet to be done: below all others, and below 0."""
+    """Value of a category in runs that are not done: below all others, and below 0."""
     return min(0, *meanings) + NOT_RUN
 
 
 class Table:
     """The variables of a sweep: their order, shapes, types and attributes.
 
-    layout: the kernel's results, the shape of each by name; shapes: the same of all variables,
-    derivatives among them.
+    layout: shapes of the kernel's results, by name; shapes: those of all variables, with
+    derivatives.
     """
 
     def __init__(self, program: Program, grid: Grid, derivatives: tuple[str, ...]):
@@ -107,8 +115,10 @@ class Table:
                     self.shapes[f"d_{name}_d_{by}"] = self.layout[name]
 
     def check_names(self) -> None:
-        """Raise a `ValueError` where two things of the dataset have one name, or a name has none in
-        a store."""
+        """Raises a `ValueError` for a bad name.
+
+        Two things in the dataset may not have one name, and stores reserve some names.
+        """
         axes, results = [*self.grid.axes], [*self.shapes]
         dimensions = {name for result in results for name in self.dims(result)[len(axes) :]}
         others = "a dimension, or ledger, and without /"
@@ -122,7 +132,7 @@ class Table:
             require_value(name not in taken and "/" not in name, "observe", expected, name)
 
     def variable(self, name: str) -> Variable:
-        """What is known of a variable."""
+        """Description of a variable."""
         if name in self.described:
             return self.described[name]
         for by in self.derivatives:
@@ -133,24 +143,24 @@ class Table:
         return Variable(name)
 
     def empty(self, name: str) -> Any:
-        """What stands for results that are yet to come."""
+        """Placeholder for results that are not there yet."""
         variable = self.variable(name)
         dtype = np.dtype(variable.dtype)
         return dtype.type(_not_done(variable.meanings) if variable.meanings else 0)
 
     def parts(self, results: np.ndarray) -> dict[str, np.ndarray]:
-        """The variables of runs, [runs, ...], from results [1 + derivatives, columns, runs]."""
+        """Variables of runs, [runs, ...], from results [1 + derivatives, columns, runs]."""
         values = by_name(self.layout, results)
         found = {}
         for name in self.shapes:
             if name in values:
                 part, dtype = values[name][0], np.dtype(self.variable(name).dtype)
-                # Codes of runs that are not finite are not numbers: 0.
+                # Codes of runs that are not finite are NaN; these become 0.
                 exact = not np.issubdtype(dtype, np.floating)
                 found[name] = (np.nan_to_num(part) if exact else part).astype(dtype)
         for i, by in enumerate(self.derivatives):
             found |= {
-                # What is no number has no derivative; the kernel has that of a constant, 0.
+                # NaN has no derivative; the kernel has that of a constant, 0.
                 f"d_{name}_d_{by}": np.where(np.isfinite(of[0]), of[i + 1], np.nan)
                 for name, of in values.items()
                 if f"d_{name}_d_{by}" in self.shapes
@@ -158,23 +168,23 @@ class Table:
         return found
 
     def dims(self, name: str) -> tuple[str, ...]:
-        """The dimensions of a variable."""
+        """Dimensions of a variable."""
         extra = [f"{name}_{i}" for i in range(len(self.shapes[name]))]
         if self.variable(name).per_belt:
             extra = ["belt"]
         return (*self.grid.axes, *extra)
 
     def attributes(self, name: str) -> dict[str, Any]:
-        """The attributes of a variable, but for the flags of categories that are numbered."""
+        """Attributes of a variable, without the flags of categories that are numbered."""
         variable = self.variable(name)
-        told: dict[str, Any] = {"long_name": variable.long_name}
+        attributes: dict[str, Any] = {"long_name": variable.long_name}
         if variable.meanings:
             meanings = {_not_done(variable.meanings): NOT_DONE, **variable.meanings}
-            told |= flags(meanings, variable.dtype)
-        return told
+            attributes |= flags(meanings, variable.dtype)
+        return attributes
 
     def coordinates(self) -> dict[str, tuple[str, np.ndarray, dict[str, str]]]:
-        """The coordinates of the dataset."""
+        """Coordinates of the dataset."""
         axes = dict(self.grid.axes)
         if any("belt" in self.dims(name) for name in self.shapes):
             axes["belt"] = np.arange(len(self.grid.example.belts))
@@ -184,11 +194,11 @@ class Table:
         }
 
     def numbered(self) -> list[str]:
-        """The variables whose categories are numbered when all runs are known."""
+        """Variables whose categories are numbered when all runs are known."""
         return [name for name in self.shapes if self.variable(name).name_of is not None]
 
     def numbering(self, name: str, codes: Iterable[int]) -> tuple[dict[int, int], dict[str, Any]]:
-        """The numbers of the categories with these codes, and the attributes that name them."""
+        """Numbers of the categories with these codes, and the attributes that name them."""
         name_of = self.variable(name).name_of
         assert name_of is not None
         belts = len(self.grid.example.belts)
@@ -197,12 +207,12 @@ class Table:
 
 #: Categories that come first where they are numbered.
 FIRST_NAMES = ("none", "smooth")
-#: The type of categories that are numbered.
+#: Type of categories that are numbered.
 NUMBERED = "int16"
 
 
 def numbered(names: Mapping[int, str]) -> tuple[dict[int, int], dict[str, Any]]:
-    """Numbers of categories whose codes have these names, and the attributes that name them."""
+    """Numbers for categories whose codes have these names, and the attributes that name them."""
     ordered = sorted(set(names.values()), key=_rank_of)
     number = {name: i for i, name in enumerate(ordered)}
     numbers = {code: number[name] for code, name in names.items()}
@@ -214,7 +224,7 @@ def _rank_of(name: str) -> tuple[Any, ...]:
 
 
 def renumber(codes: np.ndarray, numbers: dict[int, int]) -> np.ndarray:
-    """The numbers of categories for their codes."""
+    """Numbers of categories for their codes."""
     different, place = np.unique(codes, return_inverse=True)
     return np.array([numbers[int(code)] for code in different], NUMBERED)[place].reshape(
         codes.shape
@@ -222,7 +232,7 @@ def renumber(codes: np.ndarray, numbers: dict[int, int]) -> np.ndarray:
 
 
 class Memory:
-    """The results of a sweep in memory: what `Store` keeps in a file."""
+    """Results of a sweep in memory; `Store` is the same in a file."""
 
     def __init__(self, table: Table):
         self.table, self.runs = table, table.grid.runs
@@ -233,7 +243,7 @@ class Memory:
         }
 
     def put(self, block: int, positions: np.ndarray, results: np.ndarray) -> None:
-        """Take results of runs."""
+        """Stores results of runs."""
         for name, part in self.table.parts(results).items():
             self.arrays[name][positions] = part
 
@@ -242,11 +252,11 @@ class Memory:
         return {name: self.arrays[name][runs] for name in self.table.layout}
 
     def done(self) -> int:
-        """How many runs are done."""
+        """Number of runs that are done."""
         return int(np.sum(self.arrays["status"] != NOT_RUN))
 
     def interrupted(self) -> str:
-        """What becomes of the results of an interrupted sweep."""
+        """Says what becomes of the results of an interrupted sweep."""
         return (
             f"interrupted after {self.done():,} of {self.runs:,} runs, which are not kept; a sweep "
             'with a store (store="results.zarr", `jaxbelt sweep ... --out results.zarr`) keeps '
@@ -254,16 +264,16 @@ class Memory:
         )
 
     def dataset(self, attributes: dict[str, Any]) -> "xarray.Dataset":
-        """The results, labelled."""
+        """The labelled results."""
         import xarray  # with pandas, half of what `import jaxbelt` would take
 
         table, variables = self.table, {}
         numbered = table.numbered()
         for name in table.shapes:
-            values, told = self.arrays[name], table.attributes(name)
+            values, own = self.arrays[name], table.attributes(name)
             if name in numbered:
                 numbers, named = table.numbering(name, np.unique(values).tolist())
-                values, told = renumber(values, numbers), told | named
+                values, own = renumber(values, numbers), own | named
             values = values.reshape(*table.grid.shape, *values.shape[1:])
-            variables[name] = (table.dims(name), values, told)
+            variables[name] = (table.dims(name), values, own)
         return xarray.Dataset(variables, table.coordinates(), attributes)

@@ -20,10 +20,10 @@ from jaxtyping import Array, ArrayLike
 
 from ..activity import announced, note_progress
 from ..checks import as_positive, as_whole, outside_of_traces
-from ..cycles.attractors import APART, Runs, error_of_runs, place_of
+from ..cycles.attractors import MAYBE_SAME, Runs, distance, error_of_runs, place_of
 from ..cycles.cycle import cycle_from
 from ..model.equilibria import equilibria
-from ..model.oscillator import Oscillator
+from ..model.oscillator import Oscillator, refuse_clock
 from ..model.own_units import quantity, rescaled
 from ..model.parameters import leaf_index
 from ..model.variations import Variation, as_span, varied
@@ -34,42 +34,50 @@ from .attractor import CYCLE, EQUILIBRIUM, KINDS, STUCK_FOR_EVER, UNDECIDED, Att
 from .basins import as_box, check_key, rest_reached, standard_error, starts_in
 from .grid import Grid
 from .question import LONG_ENOUGH, settings_of_runs
-from .shares import told_apart
+from .shares import numbers_of_attractors
 from .work import results_of
 
 if TYPE_CHECKING:
     import pandas
 
-#: Runs that are done at once, at most, unless one value has more: their results are in memory.
+#: Largest number of runs that are done at once, unless one value has more: results are in memory.
 MOST_AT_ONCE = 2**20
-#: How far an attractor may move from value to value, unless told: this part of what the box and all
-#: attractors extend over.
+#: Default of `moves`, as a part of the extent of the box and all attractors.
 MOVES = 0.25
 #: A cycle attracts if its multiplier is below 1 by more than this, which is beyond rounding.
 ATTRACTS = 1e-9
-#: Of the cycles at one value that do not stick so many are looked into, those first to which most
-#: runs lead: what is left after that is a continuum, with a run or two on each.
+#: Number of cycles without a stick phase that are examined at one value, those with most runs
+#: first: what is left after that is a continuum, with a run or two on each.
 MOST_CYCLES = 50
-#: An attractor that moves too far from value to value is followed by parts of the way down to this.
+#: Smallest part of a step along the parameter in which an attractor is followed that moves too far.
 SMALLEST_PART = 1 / 64
-#: Where an attractor is: its smallest and largest x1 and x2; and how long a loop takes.
+#: Where an attractor is: its smallest and largest x1 and x2; and the period of a loop.
 PLACE = ("x1_min", "x1_max", "x2_min", "x2_max", "period")
 
 
 class BasinFractions(eqx.Module):
-    """What `basin_fractions` returns.
+    """Fractions of starts by attractor, along a parameter; what `basin_fractions` returns.
 
-    values: of the parameter, increasing, [values]. attractors: their names, such as "equilibrium 0"
-    and "cycle 1", in the order in which they are met along the parameter, of those met at one value
-    that with the largest fraction first. fractions: of the starts that lead there, [values,
-    attractors], 0 where none does; undecided: of those whose attractor is not known, [values]: of
-    those that go to infinity, too, and of all where the oscillator is impossible.
-    standard_errors: of the fractions, sqrt(f (1 - f) / n); 0 where f is 0 or 1: what none of the n
-    starts met has a fraction below 3/n, with a confidence of 95 per cent. x1_min, x1_max, x2_min,
-    x2_max: the extent of each attractor, [values, attractors], of what holds the mass for ever the
-    ends of the segment; period: of a cycle; all NaN where it is not met. n: starts at each value;
-    name: of the parameter, as the path to it, or that of the function's argument (then is_argument
-    is true).
+    Attributes:
+        values: Values of the parameter, increasing, [values].
+        attractors: Names such as "equilibrium 0" and "cycle 1", in the order in which they are met
+            along the parameter; of those met at one value, the one with the largest fraction first.
+        fractions: Fractions of the starts that lead to each attractor, [values, attractors], 0
+            where none does.
+        standard_errors: sqrt(f (1 - f) / n), [values, attractors]. It is 0 where f is 0 or 1; an
+            attractor that none of the n starts met has a fraction below 3/n, with a confidence of
+            95 per cent.
+        undecided: Fractions of starts whose attractor is not known, [values]. This includes starts
+            that go to infinity, and all starts where the oscillator is impossible.
+        x1_min: Smallest x1 of each attractor, [values, attractors], NaN where it is not met; for a
+            segment that holds the mass for ever its end.
+        x1_max: Largest x1, likewise.
+        x2_min: Smallest x2, likewise.
+        x2_max: Largest x2, likewise.
+        period: Periods of cycles, else NaN, [values, attractors].
+        n: Number of starts at each value.
+        name: Name of the parameter: its path, or the name of the function's argument.
+        is_argument: Whether `name` is that of a function's argument.
     """
 
     values: np.ndarray
@@ -87,9 +95,12 @@ class BasinFractions(eqx.Module):
     is_argument: bool = eqx.field(static=True, default=False)
 
     def table(self) -> "pandas.DataFrame":
-        """A row for each value and each attractor that is met there, and one for undecided starts
-        where there are some: value (of the parameter), attractor, fraction, standard_error, x1_min,
-        x1_max, x2_min, x2_max, period (NaN of what rests)."""
+        """Returns a row for each value and each attractor that is met there, and for undecided
+        starts.
+
+        Columns: value (of the parameter), attractor, fraction, standard_error, x1_min, x1_max,
+        x2_min, x2_max, period (NaN at rest).
+        """
         names = [*self.attractors, "undecided"]
         fractions = np.column_stack([self.fractions, self.undecided])
         errors = np.column_stack([self.standard_errors, standard_error(self.undecided, self.n)])
@@ -109,21 +120,26 @@ class BasinFractions(eqx.Module):
         )
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw the fractions over the parameter as bands, one on the other, into the axes `ax`
-        (None: new ones), which are returned.
+        """Draws the fractions over the parameter as bands, one on top of the other.
 
         Between values with the same attractors the edges of the bands are straight; where an
         attractor comes or goes they end half-way. Grey along an edge: two standard errors.
+
+        Args:
+            ax: Axes; None makes new ones.
+
+        Returns:
+            The axes.
         """
         return draw(self, ax)
 
     def __repr__(self) -> str:
         ends = f"{self.values[0]:.6g} to {self.values[-1]:.6g}"
         names = ", ".join(self.attractors) or "no attractor"
-        told = f"{len(self.values)} values, {self.n} starts each: {names}"
+        text = f"{len(self.values)} values, {self.n} starts each: {names}"
         most = np.max(self.undecided)
         more = f"; up to {most:.1%} undecided" if most > 0 else ""
-        return f"BasinFractions({self.name} from {ends}, {told}{more})"
+        return f"BasinFractions({self.name} from {ends}, {text}{more})"
 
 
 @announced("basin_fractions")
@@ -142,36 +158,49 @@ def basin_fractions(
     rtol: ArrayLike = 1e-8,
     atol: ArrayLike | None = None,
 ) -> BasinFractions:
-    """The fraction of a box of starts that leads to each attractor, against one parameter.
+    """Fraction of a box of starts that leads to each attractor, against one parameter.
 
-    osc, where, span: as for `scan`: an oscillator and the parameter of it that varies, or a
-    function of the parameter that returns the oscillator. box: ((x1 from, to), (x2 from, to)),
-    dimensionless; n: number of starts at each value, drawn uniformly and anew for each; key: from
-    `jax.random.key`. rows: how many values of the parameter, evenly spaced. moves: how far an
-    attractor may move from one value to the next, in x1 or x2; None: a quarter of what the box and
-    the attractors at all values extend over, in x1 or x2, whichever is longer. t1: when a run that
-    reached no attractor is given up; rtol, atol: tolerances of a step.
+    At each value attractors are distinguished as by `attractors`; equilibria and the segments on
+    which a mass is stuck for ever are identified with a row of `equilibria`.
 
-    At each value attractors are told apart as by `attractors`, equilibria and the segments on which
-    a mass is stuck for ever by which of `equilibria` they are. From one value to the next an
-    attractor keeps its name if it is of one kind (equilibrium, cycle, stuck) and its smallest and
-    largest x1 and x2 have moved by no more than `moves`. Of several ways to pair attractors so the
-    one is taken that leaves the fewest alone, and of these the one with the least sum of the
-    largest of the four moves. So a cycle that comes to stick to another belt keeps its name. An
-    attractor that pairs with none there is compared in the same way with those that were met
-    before, where they were met last: a small basin may have no start in it at a value in between.
-    What moves by more in one step, as a cycle on a steep branch may, is followed through values in
-    between, from the state in which it was: it keeps its name if it gets to one that is left alone
-    without such a move in less than a 64th of the step. What jumps is two attractors, one that ends
-    and one that begins. The other way round, `moves` that is too large joins what only lies near to
-    one another.
+    From one value to the next an attractor keeps its name if it is of one kind (equilibrium, cycle,
+    stuck) and its smallest and largest x1 and x2 have moved by no more than `moves`. Of several
+    ways to pair attractors, the one is taken that leaves the fewest alone, and of these the one
+    with the least sum of the largest of the four moves. So a cycle that comes to stick to another
+    belt keeps its name. An attractor without a partner is compared in the same way with those that
+    were met before, where they were met last: a small basin may have no start in it at a value in
+    between. An attractor that moves by more in one step, as a cycle on a steep branch may, is
+    followed through values in between, from the state in which it was: it keeps its name if it gets
+    to an unpaired one without such a move in less than a 64th of the step. An attractor that jumps
+    counts as two, one that ends and one that begins. Too large a value of `moves` joins attractors
+    that only lie near to one another.
 
-    The attractors are those that starts lead to: one with a basin that no start is in is not seen.
+    Only attractors that starts lead to are found: one with a basin that no start is in is not seen.
     Starts on closed orbits that do not attract, such as those around a centre, are undecided, and
     so are those that go to infinity, where the damping is negative. Of cycles that do not stick the
-    50 to which most starts lead are looked into at a value; where there are more, starts that lead
-    to others are undecided, too.
-    `ValueError` names an impossible argument.
+    50 with the most starts are examined at a value; where there are more, starts that lead to
+    others are undecided, too.
+
+    Args:
+        osc: An oscillator, or a function of the parameter that returns it, as for `scan`.
+        where: Selects the parameter that varies, as for `scan`; None with a function.
+        span: First and last value of the parameter.
+        box: ((x1 from, to), (x2 from, to)), dimensionless.
+        n: Number of starts at each value, drawn uniformly and anew for each.
+        key: Random key, from `jax.random.key`.
+        rows: Number of values of the parameter, evenly spaced.
+        moves: How far an attractor may move from one value to the next, in x1 or x2. None: a
+            quarter of the extent of the box and the attractors at all values, in x1 or x2,
+            whichever is longer.
+        t1: Time at which a run that has reached no attractor is given up.
+        rtol: Relative tolerance of a step.
+        atol: Absolute tolerance of a step; None: 1e-8 of the oscillator's own size.
+
+    Returns:
+        The `BasinFractions`.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
     if isinstance(osc, Oscillator):
         leaf_index(osc, where)
@@ -181,6 +210,8 @@ def basin_fractions(
     numbers = settings_of_runs(t1, rtol, atol)
     moves = None if moves is None else as_positive(moves, "moves")
     given = varied(osc, where, (first,))
+    instead = 'jb.sweep with axes x1 and x2 and observe="attractor"'
+    refuse_clock(given.oscillator(np.array([first])), "basin_fractions", instead)
     for value in (first, last):
         given.check(value)
     values = evenly_spaced(first, last, rows)
@@ -198,15 +229,15 @@ def basin_fractions(
 
 
 def _longest(corners: np.ndarray, found: list[list["_Met"]]) -> float:
-    """The longer side of what a box and all attractors extend over."""
+    """The longer side of the extent of a box and all attractors."""
     sides = [corners, *(one.place[:4].reshape(2, 2) for met in found for one in met)]
     low, high = np.min(sides, axis=(0, 2)), np.max(sides, axis=(0, 2))
     return float(np.max(high - low))
 
 
 class _Met(NamedTuple):
-    """An attractor at one value: the code of its kind, where it is (as `PLACE`), and the fraction
-    of the starts that lead there."""
+    """An attractor at one value: code of its kind, its place (as `PLACE`), and its fraction of
+    the starts."""
 
     kind: int
     place: np.ndarray
@@ -216,7 +247,7 @@ class _Met(NamedTuple):
 def _found_along(
     variation: Variation, values: np.ndarray, starts: np.ndarray, numbers: dict[str, Any]
 ) -> list[list[_Met]]:
-    """The attractors at each value that its starts, [values, 2, n], lead to, the largest fraction
+    """Attractors at each value that its starts, [values, 2, n], lead to, the largest fraction
     first."""
     grid = Grid(lambda parameter: variation.make(parameter), {"parameter": values}, (0.0, 0.0))
     program, n = grid.program(Attractor()), starts.shape[2]
@@ -232,36 +263,38 @@ def _found_along(
                 [part[which, :, place].T[None], grid.rows(first + which)[:, 2:]], axis=1
             )
 
-        told = results_of(program, grid.shared, rows_of, len(part) * n, **numbers)
+        results = results_of(program, grid.shared, rows_of, len(part) * n, **numbers)
         note_progress("telling the attractors apart")
         for row in range(len(part)):
-            here = {name: column[row * n : (row + 1) * n] for name, column in told.items()}
+            here = {name: column[row * n : (row + 1) * n] for name, column in results.items()}
             value = values[first + row : first + row + 1]
             found.append(_attractors_met(variation, value, here, error))
     return found
 
 
 def _attractors_met(
-    variation: Variation, value: np.ndarray, told: dict[str, np.ndarray], error: float
+    variation: Variation, value: np.ndarray, results: dict[str, np.ndarray], error: float
 ) -> list[_Met]:
-    """What the runs at a value, [1], lead to, the largest fraction first; told: by the observer of
-    attractors, [runs, ..]."""
-    # Codes of runs that are not finite are not numbers.
-    kinds = np.nan_to_num(told["kind"]).astype(int)
+    """Attractors of the runs at a value, [1], the largest fraction first.
+
+    results: of the observer of attractors, [runs, ..].
+    """
+    # Codes of runs that are not finite are NaN.
+    kinds = np.nan_to_num(results["kind"]).astype(int)
     if np.all(kinds == UNDECIDED):
         return []
     osc = variation.oscillator(value)
-    places = np.nan_to_num(np.stack([told[name] for name in PLACE], axis=1))
+    places = np.nan_to_num(np.stack([results[name] for name in PLACE], axis=1))
     rest, segment, ends = rest_reached(osc, 0.5 * (places[:, 0] + places[:, 1]))
     rests, stuck = kinds == EQUILIBRIUM, kinds == STUCK_FOR_EVER
     places[rests, 0] = places[rests, 1] = rest[rests]
     if len(ends):
         places[stuck, :2] = ends[segment[stuck]]
-    sticks = np.nan_to_num(told["sticks"]).astype(int)
-    runs = Runs(places, told["signature"], error)
+    sticks = np.nan_to_num(results["sticks"]).astype(int)
+    runs = Runs(places, results["signature"], error)
     kinds[_closed_only(osc, (kinds == CYCLE) & ~np.any(sticks, axis=1), runs)] = UNDECIDED
     held = np.column_stack([sticks, segment])
-    labels = told_apart(kinds[None], held[None], runs.at((None,)), lambda _: osc)[0]
+    labels = numbers_of_attractors(kinds[None], held[None], runs.at((None,)), lambda _: osc)[0]
     met = []
     for number in range(int(np.max(labels)) + 1):
         of_it = labels == number
@@ -271,23 +304,26 @@ def _attractors_met(
 
 
 def _closed_only(osc: Oscillator, smooth: np.ndarray, runs: Runs) -> np.ndarray:
-    """Which of the runs end on a closed orbit that does not attract; smooth: those that end on a
-    cycle that does not stick (one that does, attracts), or on one that was not looked into."""
-    closed, untold = np.zeros_like(smooth), smooth.copy()
+    """Which runs end on a closed orbit that does not attract.
+
+    smooth: runs that end on a cycle that does not stick (one that sticks attracts); a cycle that
+    was not examined counts as one that does not attract.
+    """
+    closed, remaining = np.zeros_like(smooth), smooth.copy()
     tops, reach = runs.places[:, 1], runs.error * np.ptp(runs.places[:, :4], axis=1)
     others = np.sort(tops[smooth])
     beside = np.searchsorted(others, tops + reach) - np.searchsorted(others, tops - reach)
     for _ in range(MOST_CYCLES):
-        if not np.any(untold):
+        if not np.any(remaining):
             return closed
-        first = int(np.argmax(np.where(untold, beside, -1)))
-        same = untold & runs.same(runs.at(first))[0]
+        first = int(np.argmax(np.where(remaining, beside, -1)))
+        same = remaining & runs.same(runs.at(first))[0]
         same[first] = True
         cycle = cycle_from(osc, jnp.asarray(np.array([runs.places[first, 1], 0.0])))
         attracts = int(cycle.status) == Status.OK and abs(float(cycle.multiplier)) < 1 - ATTRACTS
         closed |= same & (not attracts)
-        untold &= ~same
-    return closed | untold
+        remaining &= ~same
+    return closed | remaining
 
 
 def _matched(
@@ -295,8 +331,8 @@ def _matched(
 ) -> BasinFractions:
     """The attractors at each value, matched with those before it."""
     names: list[str] = []
-    last: list[_Met] = []  # each of them, where it was met last
-    numbers: list[list[int]] = []  # of the attractors at each value, in `names`
+    last: list[_Met] = []  # the attractors, each where it was met last
+    numbers: list[list[int]] = []  # for each value the numbers of its attractors in `names`
     for row, met in enumerate(found):
         just_before = numbers[-1] if numbers else []
         pairs = _partners([last[k] for k in just_before], met, moves)
@@ -327,7 +363,7 @@ def _matched(
             places[:, row, number] = one.place
             if one.kind != CYCLE:
                 places[-1, row, number] = np.nan
-    # Of as many starts: what is left is exact to rounding.
+    # A multiple of 1/n: what is left is exact to rounding.
     undecided = np.round(n * (1 - np.sum(fractions, axis=1))) / n
     columns = dict(zip(PLACE, places, strict=True))
     errors = standard_error(fractions, n)
@@ -345,8 +381,11 @@ def _matched(
 
 
 def _followed_to(variation: Variation, way: np.ndarray, one: _Met, moves: float) -> _Met | None:
-    """What an attractor at the first of two values is at the second, where it gets there without a
-    move of more than `moves` in a SMALLEST_PART of the way."""
+    """Follows an attractor from the first of two values to the second.
+
+    Returns the attractor there, or None if it moves by more than `moves` in a SMALLEST_PART of the
+    way.
+    """
     done, part = 0.0, 0.5
     while done < 1:
         to = min(1.0, done + part)
@@ -362,8 +401,11 @@ def _followed_to(variation: Variation, way: np.ndarray, one: _Met, moves: float)
 
 
 def _seeded(osc: Oscillator, one: _Met) -> _Met | None:
-    """The attractor of an oscillator that is reached from one of another: from the state in which a
-    cycle turns back; of points of rest the nearest."""
+    """The attractor of an oscillator that is reached from one of another oscillator.
+
+    A cycle is followed from the state in which it turns back; of points of rest the nearest is
+    taken.
+    """
     place = np.zeros(len(PLACE))
     if one.kind == CYCLE:
         cycle = cycle_from(osc, jnp.asarray(np.array([one.place[1], 0.0])))
@@ -383,13 +425,12 @@ def _seeded(osc: Oscillator, one: _Met) -> _Met | None:
 
 def _is_at(one: _Met, other: _Met) -> bool:
     """Whether two attractors of one kind, at one value, are at one place."""
-    size = max(float(np.max(np.abs(one.place[:4]))), 1.0)
-    return _move_between(one, other) < APART * size
+    is_beside = distance(one.place[:4], other.place[:4], least=1.0) < MAYBE_SAME
+    return one.kind == other.kind and bool(is_beside)
 
 
 def _partners(before: list[_Met], met: list[_Met], moves: float) -> dict[int, int]:
-    """Which attractor of those before each of those met now is, where it is one; see
-    `basin_fractions`."""
+    """Pairs attractors at one value with those before, see `basin_fractions`."""
     from scipy.optimize import linear_sum_assignment  # late, as only this needs it
 
     if not before or not met:
@@ -403,7 +444,7 @@ def _partners(before: list[_Met], met: list[_Met], moves: float) -> dict[int, in
 
 
 def _move_between(one: _Met, other: _Met) -> float:
-    """How far apart two attractors are, in x1 or x2; inf if of different kinds."""
+    """Distance between two attractors, in x1 or x2; inf if they are of different kinds."""
     if one.kind != other.kind:
         return np.inf
     return float(np.max(np.abs(one.place[:4] - other.place[:4])))

@@ -1,4 +1,4 @@
-"""The grid of a sweep: its points, the oscillators there, and the blocks in which it is done."""
+"""The grid of a sweep: its points, the oscillators there, and its blocks."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -30,7 +30,7 @@ from ..model.oscillator import (
 from ..model.own_units import in_units_of_run
 from ..numerics.compiling import jit, power_of_two
 
-#: Rows that are made of a few runs, too, so that few shapes are compiled.
+#: At least so many rows are made even for few runs, so that few shapes are compiled.
 FEWEST_ROWS = 2**14
 
 
@@ -60,8 +60,8 @@ class Grid:
         self.runs = math.prod(self.shape)
         self.names = [name for name in self.axes if name not in self.y0]
         check_arguments(make, self.names, "make", ", x1 or x2")
-        # An oscillator of the sweep, for the structure and for what does not vary. Whatever is
-        # impossible in it is told here; runs that are not finite are told by their status.
+        # One oscillator of the sweep, for the structure and for what does not vary. It raises for
+        # impossible values; runs that are not finite have a status.
         finite = {name: self.axes[name][np.isfinite(self.axes[name])] for name in self.names}
         first = {name: float(v[0]) if v.size else 0.0 for name, v in finite.items()}
         self.example = make(**first)
@@ -86,7 +86,7 @@ class Grid:
         found = []
 
         def probe(values):
-            # What does not depend on the mapped values is computed on the spot.
+            # Leaves that do not depend on the mapped values are computed at once.
             run = in_units_of_run(self.make(**values), edges=self.edges)
             found.extend(not is_concrete(leaf) for leaf in jax.tree.leaves(run))
             return 0
@@ -99,7 +99,7 @@ class Grid:
         return Program(self.structure, self.mapped, observer, self.edges, made_of=made_of)
 
     def length(self) -> float:
-        """The smallest own unit of length among the oscillators of the grid, as a sample tells."""
+        """Smallest own unit of length among a sample of the oscillators of the grid."""
         units = jax.tree.unflatten(self.structure, self.mapped).units
         if not units.length:
             leaves = iter(self.shared)
@@ -113,13 +113,12 @@ class Grid:
 
     def rows(self, runs: np.ndarray, derivatives: tuple[str, ...] = ()) -> np.ndarray:
         """Starts and varying parameters of some runs, [1 + derivatives, columns, runs]."""
-        padding = power_of_two(len(runs), FEWEST_ROWS) - len(runs)
-        padded = np.concatenate([runs, np.zeros(padding, runs.dtype)])
-        places = np.unravel_index(padded, self.shape)
+        size = power_of_two(len(runs), FEWEST_ROWS)
+        places = np.unravel_index(np.resize(runs, size), self.shape)
         values = {
             name: axis[place] for (name, axis), place in zip(self.axes.items(), places, strict=True)
         }
-        start = tuple(self.y0.items())
+        start = {name: np.asarray(value) for name, value in self.y0.items()}
         known = self.make, self.made_of, tuple(self.names), self.mapped, self.edges
         table = _rows(*known, start, derivatives, values)
         return np.asarray(table)[:, :, : len(runs)]
@@ -131,7 +130,8 @@ def _rows(make, made_of, names, mapped, edges, start, derivatives, values):
         osc = make(**{name: values[name] for name in names})
         leaves = jax.tree.leaves(in_units_of_run(osc, edges=edges))
         varying = [leaf for leaf, varies in zip(leaves, mapped, strict=True) if varies]
-        return jnp.stack([*(jnp.asarray(values.get(x, default)) for x, default in start), *varying])
+        starts = [jnp.asarray(values.get(name, start[name])) for name in ("x1", "x2")]
+        return jnp.stack([*starts, *varying])
 
     rows = jax.vmap(row, out_axes=1)
     tables = [rows(values)]
@@ -144,7 +144,7 @@ def _rows(make, made_of, names, mapped, edges, start, derivatives, values):
 class Blocks:
     """A grid cut into boxes of about `size` runs, each a chunk of every variable of a store.
 
-    The last axes are whole in a box as long as there is room for them; what is cut is cut evenly.
+    The last axes are whole in a box as long as there is room for them; other axes are cut evenly.
     """
 
     def __init__(self, shape: tuple[int, ...], size: int):
@@ -159,18 +159,18 @@ class Blocks:
         return math.prod(self.counts)
 
     def slices(self, block: int) -> tuple[slice, ...]:
-        """Where a block is in the grid."""
+        """Slices of a block in the grid."""
         place = np.unravel_index(block, self.counts)
         starts = [int(i) * k for i, k in zip(place, self.box, strict=True)]
         ends = map(min, map(sum, zip(starts, self.box, strict=True)), self.shape)
         return tuple(map(slice, starts, ends))
 
     def extent(self, block: int) -> tuple[int, ...]:
-        """The shape of a block: that of the box, or less at the ends of the axes."""
+        """Shape of a block: that of the box, or less at the ends of the axes."""
         return tuple(part.stop - part.start for part in self.slices(block))
 
     def size(self, block: int) -> int:
-        """How many runs a block has."""
+        """Number of runs in a block."""
         return math.prod(self.extent(block))
 
     def runs(self, block: int, positions: np.ndarray) -> np.ndarray:

@@ -1,9 +1,9 @@
 """Locks of stores: no two sweeps do the same blocks at once.
 
-Who does the blocks from `first` to `last` holds the lock file `first-last` in a hidden folder
-beside the store; whoever wants blocks among these is refused. So the processes of a cluster's job
-array, each with blocks of its own, write to one store at once. Locks are taken and left behind a
-door, the lock of the folder, which is held for a moment.
+A sweep of the blocks from `first` to `last` holds the lock file `first-last` in a hidden folder
+beside the store; another sweep that needs some of them is refused. So the processes of a cluster's
+job array, each with its own blocks, write to one store at once. A lock of the folder, the door, is
+held for a moment while locks are taken and released.
 """
 
 from collections.abc import Callable, Iterator
@@ -11,9 +11,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-#: More blocks than there are: the end of what is locked by who wants the whole store.
+#: More blocks than there are: end of the range that locks the whole store.
 ALL_BLOCKS = 2**63
-#: Seconds that may pass before the door opens: a store may be created behind it.
+#: Seconds that the door may stay closed: a store may be created behind it.
 DOOR_PATIENCE = 60.0
 
 
@@ -24,7 +24,7 @@ def locked(
     last: int = ALL_BLOCKS,
     prepare: Callable[[], Any] = lambda: None,
 ) -> Iterator[None]:
-    """Keep other sweeps off these blocks, on this machine and on others that see the folder.
+    """Keeps other sweeps off these blocks, on this machine and on others that see the folder.
 
     prepare is called behind the door, when the blocks are locked.
     """
@@ -53,7 +53,7 @@ def locked(
 
 
 def _refuse_if_held(path: Path, other: Path) -> None:
-    """Raise if somebody holds that lock; what a process left that died is removed."""
+    """Raises if another process holds that lock; removes locks of processes that died."""
     from filelock import FileLock, Timeout
 
     lock = FileLock(other, timeout=0)

@@ -1,6 +1,6 @@
 """Moments at which a reducer is asked: events, extrema, crossings of a section, fixed times.
 
-They stand in a reducer's attribute `at`, a tuple. A section is a function of the state, and its
+A reducer lists them in its attribute `at`, a tuple. A section is a function of the state, and its
 moments are where the value passes 0; extrema are sections, too: x1 is extreme where x2 = 0, and x2
 where x2' = 0.
 """
@@ -17,9 +17,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..checks import require_callable, require_one_of, require_value
+from ..checks import as_array, require, require_callable, require_one_of, require_value
 from ..model.modes import Mode, mode_acceleration, without_rounding
-from ..model.oscillator import Oscillator
+from ..model.oscillator import Oscillator, frequencies, has_clock
 from .observers import as_given
 
 
@@ -30,10 +30,13 @@ class AtEvents:
 
 @dataclass(frozen=True)
 class AtExtrema:
-    """Every extremum of a coordinate; of: "x1" or "x2".
+    """Every extremum of a coordinate.
 
-    Where x2 jumps from rising to falling at an event, that is an extremum; one that lasts for a
-    stick phase is met at its end.
+    A jump of x2 from rising to falling at an event is an extremum; one that lasts for a stick phase
+    is reported at its end.
+
+    Attributes:
+        of: "x1" or "x2".
     """
 
     of: str
@@ -46,10 +49,12 @@ class AtExtrema:
 class AtSection:
     """Every crossing of a section.
 
-    function: of the oscillator and scalars x1, x2, traced; its value passes 0 there. It has to be
-    smooth wherever runs come, also across boundaries of belts: a jump, as of the sign of a relative
-    velocity or by jnp.where, is no passage, and a run that comes to it may end there, with the
-    status TOO_MANY_STEPS. direction: 1 where the value rises, -1 where it falls, 0 for both.
+    Attributes:
+        function: Function of the oscillator and scalars x1, x2, traced; its value passes 0 at a
+            crossing. It has to be smooth wherever runs come, also across boundaries of belts: a
+            jump, such as the sign of a relative velocity or `jnp.where`, is no passage, and a run
+            that comes to it may end there, with the status TOO_MANY_STEPS.
+        direction: 1 where the value rises, -1 where it falls, 0 for both.
     """
 
     function: Any
@@ -62,7 +67,11 @@ class AtSection:
 
 @dataclass(frozen=True)
 class AtTimes:
-    """Fixed times; times: increasing, >= 0, shape [n]; those after a run's end are left out."""
+    """Fixed times; those after a run's end are left out.
+
+    Attributes:
+        times: Increasing, >= 0, shape [n].
+    """
 
     times: Any
 
@@ -76,16 +85,70 @@ class AtTimes:
         require_value(fits, "times", "finite, >= 0 and increasing", times)
         object.__setattr__(self, "times", tuple(times.tolist()))
 
+    def next_time(self, osc: Oscillator, passed: Array) -> Array:
+        """The next of the times when so many are past; inf when all are."""
+        return jnp.asarray((*self.times, np.inf))[jnp.minimum(passed, len(self.times))]
 
-MOMENTS = (AtEvents, AtExtrema, AtSection, AtTimes)
+    def passed_at(self, osc: Oscillator, t: Array, count: Array) -> Array:
+        """How many are past at the start of runs, as numbers like `count`."""
+        if not has_clock(osc):
+            return jnp.zeros_like(count)
+        early = [jnp.where(time < t, 1, 0) for time in self.times]
+        return functools.reduce(jnp.add, early, jnp.zeros_like(count)).astype(count.dtype)
+
+
+@dataclass(frozen=True)
+class AtPhase:
+    """Once in each period of the forcing: a stroboscopic section.
+
+    The moments are the times t at which Omega t is the phase up to whole turns, Omega the frequency
+    of the first force, or, without forces, of the first velocity or load that oscillates. So the
+    phase 0 is at t = 0.
+
+    Attributes:
+        phase: An angle.
+
+    Example:
+        diagram = jb.orbit_diagram(osc, where, (1.6, 1.8), at=jb.AtPhase())
+    """
+
+    phase: float = 0.0
+
+    def __post_init__(self):
+        phase = float(as_array(self.phase, "phase"))
+        require_value(np.isfinite(phase), "phase", "a finite angle", self.phase)
+        object.__setattr__(self, "phase", phase)
+
+    def next_time(self, osc: Oscillator, passed: Array) -> Array:
+        """The time of the moment that so many are before, counted from the turn of t = 0 on."""
+        return (self.phase + 2 * np.pi * passed) / frequencies(osc)[0]
+
+    def passed_at(self, osc: Oscillator, t: Array, count: Array) -> Array:
+        """The number of the first moment at t or later, as numbers like `count`."""
+        turns = (frequencies(osc)[0] * t - self.phase) / (2 * np.pi)
+        return jnp.ceil(turns - 1e-12 * (1 + jnp.abs(turns))).astype(count.dtype)
+
+
+MOMENTS = (AtEvents, AtExtrema, AtSection, AtTimes, AtPhase)
 
 
 def checked(at: Any) -> tuple[Any, ...]:
-    """The moments of a reducer, or a `ValueError`."""
+    """Checks the moments of a reducer."""
     fits = isinstance(at, tuple) and at and all(isinstance(one, MOMENTS) for one in at)
     names = ", ".join(kind.__name__ for kind in MOMENTS)
     require_value(fits, "observe.at", f"a tuple of {names}", at)
     return at
+
+
+def check_moments(at: tuple[Any, ...], osc: Oscillator) -> None:
+    """Raise a `ValueError` where moments are not for the oscillator."""
+    clock = has_clock(osc)
+    for moment in at:
+        if isinstance(moment, AtPhase):
+            require(clock, "at", "for an oscillator without forcing no AtPhase", repr(moment))
+        if isinstance(moment, AtExtrema) and moment.of == "x2":
+            told = 'AtExtrema("x1") or a section: extrema of x2 are for those without a clock'
+            require(not clock, "at", told, repr(moment))
 
 
 def section_of(moment: AtSection | AtExtrema) -> Callable[..., Array]:
@@ -112,29 +175,37 @@ def _x2_rate(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
 def value_and_rate(
     function: Callable[..., Array], osc: Oscillator, mode: Mode, x1: Array, x2: Array
 ) -> tuple[Array, Array]:
-    """A section's value and its derivative by time, along the field of the mode."""
+    """Value of a section and its derivative by time, along the field of the mode."""
     a = jnp.where(mode.any_stuck, 0.0, mode_acceleration(osc, mode, x1, x2))
     value, rate, *_ = jax.jvp(lambda x1, x2: function(osc, mode, x1, x2), (x1, x2), (x2, a))
     return value, rate
 
 
 def side_of(value: Array, rate: Array, before: Array) -> Array:
-    """The side of a section, 1 or -1: on it, where the motion goes; at rest on it, as before."""
+    """Side of a section, 1 or -1.
+
+    On the section it is the side that the motion goes to; at rest on it, the one before.
+    """
     return jnp.where(value != 0, jnp.sign(value), jnp.where(rate != 0, jnp.sign(rate), before))
 
 
 # --- where a section is crossed -------------------------------------------------------------------
 
-#: Equal parts of a step, and of a stick phase, in which crossings of a section are looked for. In a
-#: part with one extremum of its value, or none, all are found.
+#: Equal parts of a step, and of a stick phase, in which crossings of a section are searched. In a
+#: part with at most one extremum of the value all crossings are found.
 PARTS_OF_STEP, PARTS_OF_HOLD = 4, 8
-#: A cut that would leave less of a step at one of its ends, over the step, is not made.
+#: Smallest part of a step that a cut may leave at one of its ends.
 LEAST_CUT = 1e-3
 
 
 class Course(NamedTuple):
-    """The state along a way from 0 to 1, arrays [lanes]: polynomials of x1 and, of a stick phase,
-    constant x2; duration: of the way."""
+    """The state along a way from 0 to 1, arrays [lanes].
+
+    Attributes:
+        x1: Coefficients of a polynomial.
+        x2: The constant velocity of a stick phase; None for a step.
+        duration: Duration of the way.
+    """
 
     x1: tuple[Array, ...]
     x2: Array | None
@@ -148,8 +219,8 @@ class Course(NamedTuple):
         last = 10 * d - 4 * e + 0.5 * f, -15 * d + 7 * e - f, 6 * d - 3 * e + 0.5 * f
         return cls((p0, v0, 0.5 * a0, *last), None, h)
 
-    def look(self, function, osc, mode, theta) -> tuple[Array, Array]:
-        """A section's value, and its derivative by theta."""
+    def sample(self, function, osc, mode, theta) -> tuple[Array, Array]:
+        """Value of a section, and its derivative by theta."""
         x1 = _polynomial(self.x1, theta)
         slopes = [k * c for k, c in enumerate(self.x1)][1:]
         bends = [k * c for k, c in enumerate(slopes)][1:]
@@ -165,11 +236,15 @@ class Course(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """What is known of a section at the ends of the parts of a way, lists of arrays [lanes].
+    """A section at the ends of the parts of a way, lists of arrays [lanes].
 
-    values, slopes: by theta, one more than there are parts; sides: likewise, from that before on;
-    crosses: whether the side changes in a part; dips: whether the value comes nearer to 0 in it and
-    goes away again, so that it may pass twice.
+    Attributes:
+        values: One more than there are parts.
+        slopes: Derivatives by theta, likewise.
+        sides: Sides, likewise, beginning with the one before.
+        crosses: Whether the side changes in a part.
+        dips: Whether the value comes nearer to 0 in a part and goes away again, so that it may pass
+            0 twice.
     """
 
     values: list[Array]
@@ -179,8 +254,8 @@ class Parts(NamedTuple):
     dips: list[Array]
 
     @classmethod
-    def of(cls, looks: Sequence[tuple[Array, Array]], side: Array) -> "Parts":
-        values, slopes = (list(part) for part in zip(*looks, strict=True))
+    def of(cls, samples: Sequence[tuple[Array, Array]], side: Array) -> "Parts":
+        values, slopes = (list(part) for part in zip(*samples, strict=True))
         sides = [side]
         for value, slope in zip(values[1:], slopes[1:], strict=True):
             sides.append(side_of(value, slope, sides[-1]))
@@ -194,23 +269,30 @@ class Parts(NamedTuple):
 
 
 class Cut(NamedTuple):
-    """Where a step should be cut for a section, from 0 to 1, 1: it may stay as it is; and whether
-    it then crosses the section near its start, and not near its end."""
+    """Where a step should be cut for a section.
+
+    theta: from 0 to 1; at 1 no cut is needed. at_start: whether the cut step crosses the section
+    near its start, not near its end.
+    """
 
     theta: Array
     at_start: Array
 
 
-def cut_of_step(side: Array, looks: Sequence[tuple[Array, Array]], h: Array, reach: Array) -> Cut:
-    """Where a step of size h should be cut, so that it crosses a section once at most, near an end.
+def cut_of_step(side: Array, samples: Sequence[tuple[Array, Array]], h: Array, reach: Array) -> Cut:
+    """Where a step of size h should be cut, so that it crosses a section at most once, near an end.
 
-    side: of the section, before the step; looks: its value, and derivative by theta, at the ends of
-    the parts, those inside by the interpolant; reach: an end that is nearer to a crossing than this
-    time tells the crossing by a Taylor step. Within a part the value is taken for the cubic that
-    these give: the step is made again, and its end then is nearer, until it is near enough.
+    Within a part the value is approximated by the cubic through its values and slopes: the step is
+    repeated, and its end is then nearer, until it is near enough.
+
+    Args:
+        side: Side of the section before the step.
+        samples: Value and derivative by theta at the ends of the parts, inside by the interpolant.
+        h: Size of the step.
+        reach: An end that is nearer to a crossing than this time finds it by a Taylor step.
     """
-    side, looks, h, reach = lax.stop_gradient((side, looks, h, reach))
-    parts = Parts.of(looks, side)
+    side, samples, h, reach = lax.stop_gradient((side, samples, h, reach))
+    parts = Parts.of(samples, side)
     n = len(parts.crosses)
     depth = functools.reduce(jnp.maximum, [side * value for value in parts.values])
     found, picked = [], None
@@ -233,12 +315,12 @@ def cut_of_step(side: Array, looks: Sequence[tuple[Array, Array]], h: Array, rea
     root = (k + _bisected(lambda theta: _polynomial(cubic, theta), at_part)) / n
     count = sum(here.astype(jnp.int32) for here in found)
 
-    (g0, r0), (g1, r1) = looks[0], looks[-1]
+    (g0, r0), (g1, r1) = samples[0], samples[-1]
     near = reach / jnp.where(h > 0, h, 1.0)
     at_start = parts.crosses[0] & (side * r0 < 0) & (jnp.abs(g0) <= near * jnp.abs(r0))
     at_end = parts.crosses[-1] & (parts.sides[-1] * r1 > 0) & (jnp.abs(g1) <= near * jnp.abs(r1))
     stays = (count == 0) | ((count == 1) & (at_start | at_end))
-    # What is near the start is met in a step of one part.
+    # A crossing near the start is found after a step of one part.
     theta = jnp.where(crosses, jnp.where(at_start, 1 / n, root), extremum)
     # Where a section is only touched, no end is ever near; the step is then as short as `reach`.
     theta = jnp.where(stays | (h <= 0.1 * reach), 1.0, theta)
@@ -247,18 +329,26 @@ def cut_of_step(side: Array, looks: Sequence[tuple[Array, Array]], h: Array, rea
 
 
 def crossings_held(
-    look: Callable[[Array], tuple[Array, Array]], side: Array, direction: int, holds: Array
+    sample: Callable[[Array], tuple[Array, Array]], side: Array, direction: int, holds: Array
 ) -> tuple[Array, Array, Array]:
-    """Where a section is crossed in stick phases: two at most in each of `PARTS_OF_HOLD` parts.
+    """Crossings of a section in stick phases: at most two in each of `PARTS_OF_HOLD` parts.
 
-    look(theta): value and derivative by theta, for theta from 0 to 1; side: before; direction: that
-    is wanted, 0 for both; holds: lanes that stick. Returns the side at the end and theta of the
-    crossings, twice [parts, lanes], inf where there is none. x1 moves evenly, so all are found of a
-    value with one extremum in a part, or none; others may be missed in pairs.
+    x1 moves evenly, so all are found if the value has at most one extremum in a part; others may be
+    missed in pairs.
+
+    Args:
+        sample: sample(theta) is the value and its derivative by theta, for theta from 0 to 1.
+        side: Side before the phase.
+        direction: Direction of the crossings to find, 0 for both.
+        holds: Lanes that stick.
+
+    Returns:
+        The side at the end, and theta of the crossings, twice [parts, lanes], inf where there is
+        none.
     """
     n = PARTS_OF_HOLD
-    looks = [look(jnp.full_like(side, k / n)) for k in range(n + 1)]
-    parts = Parts.of(looks, side)
+    samples = [sample(jnp.full_like(side, k / n)) for k in range(n + 1)]
+    parts = Parts.of(samples, side)
     sides = jnp.stack(parts.sides[:-1])
     dips = jnp.stack([dip & holds for dip in parts.dips])
     some = jnp.stack([cross & holds for cross in parts.crosses]) | dips
@@ -276,7 +366,7 @@ def crossings_held(
         dip = jnp.any(here & dips, axis=0)
 
         def at(theta):
-            return look((i.astype(theta.dtype) + theta) / n)
+            return sample((i.astype(theta.dtype) + theta) / n)
 
         extremum = _bisected(lambda theta: -at(theta)[1], start)
         twice = dip & (start * at(extremum)[0] < 0)
@@ -296,7 +386,7 @@ def crossings_held(
 
 
 def _cubic(parts: Parts, k: int, length: float) -> tuple[Array, ...]:
-    """The value in a part, by its values and slopes at both ends."""
+    """Cubic through the values and slopes at both ends of a part."""
     g0, g1 = parts.values[k], parts.values[k + 1]
     d0, d1 = length * parts.slopes[k], length * parts.slopes[k + 1]
     return g0, d0, 3 * (g1 - g0) - 2 * d0 - d1, d0 + d1 - 2 * (g1 - g0)

@@ -12,9 +12,10 @@ from jaxtyping import Array
 from ..kernel.events import event_kinds
 from ..kernel.lanes import Observer, Variable, choose
 from ..kernel.marks import Mark
+from ..model.oscillator import has_clock
 from ..model.own_units import OwnOscillator, in_units_of_user
 
-#: What contact codes stand for.
+#: Meanings of contact codes.
 CONTACTS = {
     -2: "below the belt's interval",
     -1: "slips with nu < omega x2",
@@ -27,9 +28,9 @@ CONTACTS = {
 class Final(Observer):
     """The state at t1.
 
-    At the end of a stick phase the state is a function of the parameters alone. Where it repeats,
-    everything repeats, to the last bit; so the run then skips as many whole loops as there are left
-    (unless `skip` is false).
+    At the end of a stick phase the state is a function of the parameters alone. Once it repeats,
+    everything repeats to the last bit; the run then skips all whole loops that are left (unless
+    `skip` is false).
     """
 
     variables: ClassVar[Mapping[str, Variable]] = {
@@ -46,7 +47,8 @@ class Final(Observer):
         return Mark.none(lanes.t)
 
     def watch(self, osc, lanes, passage, ones, t1, tol):
-        if not self.skip:
+        # With a clock the state does not repeat where x1 and x2 do.
+        if not self.skip or has_clock(osc):
             return lanes
         mark: Mark = lanes.memory
         released = passage.released & ~lanes.mode.any_stuck
@@ -68,7 +70,7 @@ class Final(Observer):
 def as_given(
     function: Callable[..., Any], osc: OwnOscillator, x1: Array, x2: Array, *more: Array
 ) -> Any:
-    """What a function of the user's tells of each lane, an oscillator and a state in its units.
+    """Calls a user's function for each lane, with an oscillator and a state in the user's units.
 
     more: further arguments, [lanes, ...], which are in the user's units already.
     """
@@ -84,10 +86,16 @@ def as_given(
 
 
 class RunEvent(eqx.Module):
-    """A moment of a run, as a reducer sees it: scalars t, x1, x2, kind (`EventKind`) and belt.
+    """A moment of a run, as a reducer sees it; scalars.
 
-    Of a reducer with `at` or `rates` also moment, the number in `at`, and integrals, those of the
-    rates from 0 to t; at moments that are no events kind is 0 and belt -1.
+    Attributes:
+        t: Time.
+        x1: Displacement.
+        x2: Velocity.
+        kind: An `EventKind`; 0 at moments that are no events.
+        belt: Number of the belt; -1 at moments that are no events.
+        moment: For a reducer with `at` or `rates`: number of the moment in `at`.
+        integrals: Likewise: integrals of the rates from 0 to t.
     """
 
     t: Array
@@ -100,7 +108,15 @@ class RunEvent(eqx.Module):
 
 
 class RunEnd(eqx.Module):
-    """The end of a run, as a reducer sees it: scalars t, x1, x2 and status; integrals likewise."""
+    """The end of a run, as a reducer sees it; scalars.
+
+    Attributes:
+        t: Time.
+        x1: Displacement.
+        x2: Velocity.
+        status: A `Status` code.
+        integrals: For a reducer with `at` or `rates`: integrals of the rates from 0 to t.
+    """
 
     t: Array
     x1: Array
@@ -110,7 +126,7 @@ class RunEnd(eqx.Module):
 
 
 class Reduce(Observer):
-    """What a user's reducer makes of the events of a run; see `sweep.sweep`."""
+    """Observer of a user's reducer of events; see `sweep.sweep`."""
 
     reducer: Any = eqx.field(static=True)
 

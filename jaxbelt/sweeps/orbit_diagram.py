@@ -1,10 +1,10 @@
-"""Orbit diagrams: what orbits come to, along a path in one parameter, by brute force.
+"""Orbit diagrams: the points of attractors along a path in one parameter, by brute force.
 
 At each of many values of the parameter orbits from a few starts are followed to their attractor,
-and the points at which it has some moment (extrema, crossings of a section, events) are kept. Two
-sweeps do it: one as with `observe="attractor"`, so that each run takes the transient that it needs,
-and one that follows each cycle through one loop, from its largest displacement. The values of the
-parameter are data of both: other values compile nothing, and so a picture can be zoomed into.
+and its points at some moment (extrema, crossings of a section, events) are kept. Two sweeps do it:
+one as with `observe="attractor"`, so that each run takes the transient that it needs, and one that
+follows each cycle through one loop, from its largest displacement. The values of the parameter are
+data of both: other values compile nothing, and so a picture can be zoomed into.
 """
 
 from collections import Counter
@@ -29,7 +29,7 @@ from ..checks import (
     require_value,
 )
 from ..cycles.attractors import RUN
-from ..model.oscillator import Oscillator
+from ..model.oscillator import Oscillator, frequencies, has_clock
 from ..model.parameters import leaf_index
 from ..model.variations import Variation, as_span, varied
 from ..numerics.spacing import evenly_spaced
@@ -38,7 +38,7 @@ from ..tables import table_of
 from .along import Along
 from .attractor import CYCLE, KINDS, UNDECIDED, Attractor
 from .grid import Grid
-from .moments import AtEvents, AtExtrema, AtSection
+from .moments import AtEvents, AtExtrema, AtPhase, AtSection
 from .question import LONG_ENOUGH
 from .reducers import check_sections
 from .work import results_of
@@ -46,25 +46,39 @@ from .work import results_of
 if TYPE_CHECKING:
     import pandas
 
-#: Moments of a loop, extrema of x1 among them, that one run has room for. A loop with more of them
-#: takes several runs, each from the last extremum: a start at an event may have it once more.
+#: Number of moments of a loop, extrema of x1 among them, that one run has room for. A loop with
+#: more moments takes several runs, each from the last extremum: a start at an event may repeat that
+#: event.
 MOMENTS_KEPT = 16
-#: Runs for one loop, at most.
+#: Largest number of runs for one loop.
 MOST_RUNS = 64
 #: A run through a loop goes on beyond it by this fraction of the period.
 OUTSIDE = 1e-4
 
 
-class OrbitDiagram(eqx.Module):
-    """What `orbit_diagram` returns.
+#: Of a forced oscillator: periods that are left out at first, points that are kept, and by how much
+#: they may differ, over their size, to be those of a periodic motion.
+TRANSIENT, STROBES = 300, 64
+SAME = 1e-6
 
-    values: of the parameter, increasing, [values]. kind: what each start leads to, "equilibrium",
-    "cycle", "stuck" (for ever, to a belt at rest) or "undecided", [values, starts]; period: of a
-    cycle, else NaN, likewise; status: a `Status` each. x1, x2: the points of the attractors,
-    [values, starts, points], NaN where there are fewer: of a cycle one for each of its moments, in
-    their order; of what rests the one at which it does; dimensionless. at: which moments these are;
-    name: of the parameter, as the path to it, or that of the function's argument (then is_argument
-    is true); sampling: what `over` asks again.
+
+class OrbitDiagram(eqx.Module):
+    """Points of attractors along a parameter; what `orbit_diagram` returns.
+
+    Attributes:
+        values: Values of the parameter, increasing, [values].
+        kind: Attractor of each start: "equilibrium", "cycle", "stuck" (for ever, to a belt at rest)
+            or "undecided", [values, starts].
+        period: Periods of cycles, else NaN, [values, starts].
+        status: A `Status` each, [values, starts].
+        x1: Points of the attractors, [values, starts, points], dimensionless, NaN where there are
+            fewer: of a cycle one for each of its moments, in their order; of an equilibrium its
+            place.
+        x2: Velocities at these points, likewise.
+        at: The moments.
+        name: Name of the parameter: its path, or the name of the function's argument.
+        sampling: Arguments that `over` uses again.
+        is_argument: Whether `name` is that of a function's argument.
     """
 
     values: np.ndarray
@@ -79,13 +93,26 @@ class OrbitDiagram(eqx.Module):
     is_argument: bool = eqx.field(static=True, default=False)
 
     def over(self, span: tuple[float, float]) -> "OrbitDiagram":
-        """The same over another span of the parameter, (first, last): with as many values, so that
-        nothing is compiled. `ValueError` where the oscillator at an end is impossible."""
+        """The same diagram over another span of the parameter, with as many values: nothing is
+        compiled.
+
+        Args:
+            span: First and last value of the parameter.
+
+        Returns:
+            The new `OrbitDiagram`.
+
+        Raises:
+            ValueError: If the oscillator at an end is impossible.
+        """
         return self.sampling.diagram(span)
 
     def table(self) -> "pandas.DataFrame":
-        """A row for each point: value (of the parameter), start (its number), kind, period (NaN of
-        what rests), x1, x2. What is undecided has a row in which they are NaN."""
+        """Returns a row for each point.
+
+        Columns: value (of the parameter), start (its number), kind, period (NaN at rest), x1, x2.
+        An undecided start has a row with NaN.
+        """
         held = ~np.isnan(self.x1)
         held[..., 0] |= self.kind == KINDS[UNDECIDED]
         rows, starts, _ = np.nonzero(held)
@@ -101,13 +128,17 @@ class OrbitDiagram(eqx.Module):
         )
 
     def plot(self, ax: Any = None, *, quantity: str | None = None, zoom: bool = False) -> Any:
-        """Draw the points over the parameter, into the axes `ax` (None: new ones), which are
-        returned.
+        """Draws the points over the parameter.
 
-        quantity: "x1" or "x2"; None: the one whose extrema the points are, else "x1". zoom: whether
-        the points are computed anew, as by `over`, whenever the limits of the parameter change:
-        with the mouse, where the backend of matplotlib is interactive (in a notebook
-        `%matplotlib widget`, of the package ipympl), or by `ax.set_xlim`.
+        Args:
+            ax: Axes; None makes new ones.
+            quantity: "x1" or "x2"; None: the one whose extrema the points are, else "x1".
+            zoom: Whether the points are computed anew, as by `over`, whenever the limits of the
+                parameter change: with the mouse, where the backend of matplotlib is interactive (in
+                a notebook `%matplotlib widget`, of the package ipympl), or by `ax.set_xlim`.
+
+        Returns:
+            The axes.
         """
         return draw(self, ax, quantity=quantity, zoom=zoom)
 
@@ -125,45 +156,62 @@ def orbit_diagram(
     where: Callable[[Oscillator], Any] | None = None,
     span: tuple[float, float] | None = None,
     *,
-    at: AtExtrema | AtSection | AtEvents | None = None,
+    at: AtExtrema | AtSection | AtEvents | AtPhase | None = None,
     y0: ArrayLike | Sequence[Any] = (3.0, 0.0),
     rows: int = 400,
     rtol: ArrayLike = 1e-8,
     atol: ArrayLike | None = None,
 ) -> OrbitDiagram:
-    """The points of attractors against one parameter, from given starts: an orbit diagram.
+    """Orbit diagram: the points of attractors against one parameter, from given starts.
 
-    osc, where, span: as for `scan`: an oscillator and the parameter of it that varies, or a
-    function of the parameter that returns the oscillator. at: the moments at which a cycle has its
-    points, in one loop: `AtExtrema` of "x1" (None) or "x2", an `AtSection`, or `AtEvents`. y0:
-    start (x1, x2), or several, [starts, 2]: where attractors coexist, each start shows its own.
-    rows: how many values of the parameter, evenly spaced. rtol, atol: tolerances of a step.
+    There is no transient to choose: each run goes on until its attractor is known, or until t =
+    30,000, when it is undecided, with the status NOT_SETTLED and without points. A cycle that does
+    not come back to where it began, to a thousand times the tolerance, is undecided, too. A loop of
+    many hundred moments is cut off, with the status TOO_MANY_STEPS. Unstable motions are in
+    `bifurcation_diagram` only.
 
-    There is no transient to choose: each run goes on until its attractor is known, or until
-    t = 30,000, when it is undecided, with the status NOT_SETTLED and without points. So is a cycle
-    that does not come back to where it began, to a thousand times the tolerance. A loop of many
-    hundred moments is cut off, with the status TOO_MANY_STEPS. What is unstable is in
-    `bifurcation_diagram` only. `ValueError` names an impossible argument.
+    Args:
+        osc: An oscillator, or a function of the parameter that returns it, as for `scan`.
+        where: Selects the parameter that varies, as for `scan`; None with a function.
+        span: First and last value of the parameter.
+        at: Moments at which a cycle has its points, in one loop: `AtExtrema` of "x1" (None) or
+            "x2", an `AtSection`, or `AtEvents`.
+        y0: Start (x1, x2), or several, [starts, 2]: where attractors coexist, each start shows its
+            own.
+        rows: Number of values of the parameter, evenly spaced.
+        rtol: Relative tolerance of a step.
+        atol: Absolute tolerance of a step; None: 1e-8 of the oscillator's own size.
+
+    Returns:
+        The `OrbitDiagram`.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
     if isinstance(osc, Oscillator):
         leaf_index(osc, where)
     first, last = as_span(span, where)
-    at = AtExtrema("x1") if at is None else at
-    kinds = AtExtrema | AtSection | AtEvents
-    require_value(isinstance(at, kinds), "at", "an AtExtrema, AtSection or AtEvents", at)
     starts = _starts_of(y0)
     numbers = {"rtol": as_positive(rtol, "rtol"), "atol": as_tolerance(atol, "atol")}
     variation = varied(osc, where, (first,))
     rows = as_whole(rows, "rows", 2)
-    check_sections((at,), variation.oscillator(np.array([first])))
+    example = variation.oscillator(np.array([first]))
+    if has_clock(example):
+        at = AtPhase() if at is None else at
+        require_value(isinstance(at, AtPhase), "at", "an AtPhase, as osc is forced", at)
+    else:
+        at = AtExtrema("x1") if at is None else at
+        kinds = AtExtrema | AtSection | AtEvents
+        require_value(isinstance(at, kinds), "at", "an AtExtrema, AtSection or AtEvents", at)
+    check_sections((at,), example)
     return Sampling(variation, at, starts, rows, numbers).diagram((first, last))
 
 
 def _starts_of(y0: Any) -> np.ndarray:
-    """The starts, [starts, 2], or a `ValueError`."""
+    """Checks the starts, [starts, 2]."""
     try:
         are_several = np.ndim(y0) == 2
-    except ValueError:  # rows of different lengths, which are told below
+    except ValueError:  # rows of different lengths; the check below raises
         are_several = False
     starts = np.asarray(as_array(y0, "y0", (None, 2) if are_several else (2,)))
     check_finite(starts, "y0")
@@ -173,7 +221,8 @@ def _starts_of(y0: Any) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Sampling:
-    """How the points of an orbit diagram are found, whatever its span; see `orbit_diagram`."""
+    """Arguments that determine the points of an orbit diagram, except its span; see
+    `orbit_diagram`."""
 
     variation: Variation
     at: Any
@@ -189,17 +238,19 @@ class Sampling:
         values = evenly_spaced(first, last, self.rows)
         grid = Grid(self._make, {"parameter": values}, (0.0, 0.0))
         shape = len(values), len(self.starts)
+        if isinstance(self.at, AtPhase):
+            return self._strobed(grid, values, shape)
         found = self._results(grid, Attractor(), np.tile(self.starts.T, len(values)), LONG_ENOUGH)
-        # Codes of runs that are not finite are not numbers.
+        # Codes of runs that are not finite are NaN.
         kind = np.nan_to_num(found["kind"]).astype(int)
         status = found["status"].astype(int)
         x1, x2 = (found[name][:, None] for name in RESTS_AT)
         cycles = np.flatnonzero(kind == CYCLE)
         if len(cycles):
             loops = {name: found[name][cycles] for name in ("x1_min", "x1_max", "period")}
-            told, *points = self._loops(grid, cycles, **loops)
-            status[cycles] = told
-            kind[cycles[told == Status.NOT_SETTLED]] = UNDECIDED
+            ended, *points = self._loops(grid, cycles, **loops)
+            status[cycles] = ended
+            kind[cycles[ended == Status.NOT_SETTLED]] = UNDECIDED
             missing = ((0, 0), (0, points[0].shape[1] - 1))
             x1, x2 = (np.pad(x, missing, constant_values=np.nan) for x in (x1, x2))
             x1[cycles], x2[cycles] = points
@@ -216,28 +267,70 @@ class Sampling:
             is_argument=not self.variation.varies_leaves,
         )
 
+    def _strobed(self, grid: Grid, values: np.ndarray, shape: tuple[int, int]) -> OrbitDiagram:
+        """The diagram of a stroboscopic section: STROBES points behind TRANSIENT periods."""
+        first = [float(frequencies(self._make(value))[0]) for value in values]
+        period = 2 * np.pi / np.repeat(first, shape[1])
+        t1 = float(np.max(period)) * (TRANSIENT + STROBES + 1)
+        observer = Along(_Strobes((self.at,), TRANSIENT, STROBES))
+        states = np.tile(self.starts.T, len(values))
+        found = self._results(grid, observer, states, t1, t0=0.0)
+        pieces = [f" {i}" for i in range(STROBES // 8)]
+        x1, x2 = (
+            np.concatenate([found[name + piece] for piece in pieces], axis=-1)
+            for name in ("x1", "x2")
+        )
+        # Runs of other frequencies may have a period less.
+        status = found["status"].astype(int)
+        good = (status == Status.OK) | (status == Status.STUCK_FOREVER)
+        x1[~good], x2[~good] = np.nan, np.nan
+        turns = _turns_in(x1, x2)
+        kind = np.where(turns > 0, "periodic", KINDS[UNDECIDED])
+        once = (turns[:, None] > 0) & (np.arange(STROBES) >= turns[:, None])
+        x1, x2 = (np.where(once, np.nan, x) for x in (x1, x2))
+        return OrbitDiagram(
+            values=values,
+            kind=kind.reshape(shape),
+            period=np.where(turns > 0, turns * period, np.nan).reshape(shape),
+            status=status.reshape(shape),
+            x1=x1.reshape(*shape, -1),
+            x2=x2.reshape(*shape, -1),
+            at=self.at,
+            name=self.variation.names[0],
+            sampling=self,
+            is_argument=not self.variation.varies_leaves,
+        )
+
     def _make(self, parameter: Any) -> Oscillator:
         return self.variation.make(parameter)
 
     def _results(
-        self, grid: Grid, observer: Any, states: np.ndarray, t1: float, which: Any = None
+        self,
+        grid: Grid,
+        observer: Any,
+        states: np.ndarray,
+        t1: float,
+        which: Any = None,
+        t0: float | None = None,
     ) -> dict[str, np.ndarray]:
-        """What an observer tells of runs from states, [2, runs]; which: their numbers, or all."""
+        """Results of an observer for runs from states, [2, runs]; which: their numbers, or all."""
         which = np.arange(states.shape[1]) if which is None else which
 
         def rows_of(first: int, last: int) -> np.ndarray:
             rows = grid.rows(which[first:last] // len(self.starts))
             return np.concatenate([states[None, :, first:last], rows[:, 2:]], axis=1)
 
-        numbers = {"t1": t1, **self.numbers}
+        numbers = {"t1": t1, "t0": t0, **self.numbers}
         return results_of(grid.program(observer), grid.shared, rows_of, len(which), **numbers)
 
     def _loops(self, grid: Grid, which: np.ndarray, x1_min, x1_max, period):
-        """Status, x1 and x2 of the moments of one loop of cycles, [cycles] and [cycles, points];
-        which: the numbers of the runs that led to them."""
+        """Status, x1 and x2 of the moments of one loop of cycles, [cycles] and [cycles, points].
+
+        which: numbers of the runs that led to the cycles.
+        """
         period, top = period[:, None], x1_max[:, None]
         (t, x1, x2, number), cut = self._moments(grid, which, x1_max, (1 + OUTSIDE) * period[:, 0])
-        # One loop: what is that near to its beginning is met again at its end.
+        # One loop: moments that near to its beginning are met again at its end.
         inside = (t > OUTSIDE * period) & (t <= (1 + OUTSIDE) * period)
         size = RUN * self.numbers["rtol"] * (top - x1_min[:, None])
         back = inside & (number == EXTREMUM) & (np.abs(x1 - top) < size)
@@ -253,48 +346,92 @@ class Sampling:
         return status, *(np.where(held, x, np.nan) for x in points)
 
     def _moments(self, grid: Grid, which: np.ndarray, x1_max: np.ndarray, end: np.ndarray):
-        """The moments of loops until a time each, one after another: t, x1, x2 and the number,
-        [4, cycles, moments], NaN where there is none; and which loops are cut off, [cycles]."""
+        """The moments of loops until a time each, in order.
+
+        Returns t, x1, x2 and the number, [4, cycles, moments], NaN where there is none; and which
+        loops are cut off, [cycles].
+        """
         at = (AtExtrema("x1"),) if self.at == AtExtrema("x1") else (AtExtrema("x1"), self.at)
         observer = Along(_LoopPoints(at, MOMENTS_KEPT))
         moments, cut = np.zeros((4, len(which), 0)), np.zeros(len(which), bool)
         state, began = np.stack([x1_max, np.zeros_like(x1_max)]), np.zeros_like(x1_max)
-        left = np.arange(len(which))
+        remaining = np.arange(len(which))
         for _ in range(MOST_RUNS):
-            until = float(np.max((end - began)[left])) * (1 + OUTSIDE)
-            found = self._results(grid, observer, state[:, left], until, which[left])
+            until = float(np.max((end - began)[remaining])) * (1 + OUTSIDE)
+            found = self._results(grid, observer, state[:, remaining], until, which[remaining])
             pieces = [f" {i}" for i in range(-(-MOMENTS_KEPT // 8))]
             columns = ([found[name + piece] for piece in pieces] for name in OF_MOMENTS)
             new = np.stack([np.concatenate(one, axis=-1) for one in columns])
-            new[0] += began[left, None]
-            # Where the room is used up, on from the last extremum, if there is one.
-            cut[left] = new[0, :, -1] < end[left]
+            new[0] += began[remaining, None]
+            # Where the room is used up, the next run begins at the last extremum, if there is one.
+            cut[remaining] = new[0, :, -1] < end[remaining]
             turns = new[3] == EXTREMUM
             last = MOMENTS_KEPT - 1 - np.argmax(turns[:, ::-1], axis=1)
-            on = cut[left] & np.any(turns, axis=1)
+            on = cut[remaining] & np.any(turns, axis=1)
             new[:, on[:, None] & (np.arange(MOMENTS_KEPT) > last[:, None])] = np.nan
             whole = np.full((4, len(which), MOMENTS_KEPT), np.nan)
-            whole[:, left] = new
+            whole[:, remaining] = new
             moments = np.concatenate([moments, whole], axis=2)
-            began[left[on]], state[:, left[on]] = new[0, on, last[on]], new[1:3, on, last[on]]
-            left = left[on]
-            if not len(left):
+            began[remaining[on]], state[:, remaining[on]] = (
+                new[0, on, last[on]],
+                new[1:3, on, last[on]],
+            )
+            remaining = remaining[on]
+            if not len(remaining):
                 break
         return moments, cut
 
 
-#: Numbers of the moments of a loop: extrema of x1, and those that are wanted, if they are others.
+def _turns_in(x1: np.ndarray, x2: np.ndarray) -> np.ndarray:
+    """After how many points rows of them repeat, all of them, half as many at most; 0: not."""
+    turns = np.zeros(len(x1), dtype=int)
+    sizes = [SAME * (np.ptp(x, axis=1) + np.max(np.abs(x), axis=1)) for x in (x1, x2)]
+    for n in reversed(range(1, x1.shape[1] // 2 + 1)):
+        away = [np.max(np.abs(x[:, n:] - x[:, :-n]), axis=1) for x in (x1, x2)]
+        turns[(away[0] <= sizes[0]) & (away[1] <= sizes[1])] = n
+    return turns
+
+
+@dataclass(frozen=True)
+class _Strobes:
+    """The states at the moments of a run behind the first `skipped` ones, `room` of them, a
+    multiple of eight. A reducer, see `sweep.sweep`, as `_LoopPoints`."""
+
+    at: tuple[Any, ...]
+    skipped: int
+    room: int
+
+    def init(self, osc, x1, x2):
+        pieces = tuple(jnp.full(8, jnp.nan) for _ in range(self.room // 8))
+        return pieces, pieces, jnp.zeros((), int) - self.skipped
+
+    def update(self, state, event):
+        kept1, kept2, count = state
+
+        def put(value, pieces):
+            places = (8 * i + jnp.arange(8) for i in range(len(pieces)))
+            pairs = zip(places, pieces, strict=True)
+            return tuple(jnp.where(place == count, value, piece) for place, piece in pairs)
+
+        return put(event.x1, kept1), put(event.x2, kept2), count + 1
+
+    def finish(self, state, end):
+        pairs = zip(("x1", "x2"), state[:2], strict=True)
+        return {f"{name} {i}": piece for name, own in pairs for i, piece in enumerate(own)}
+
+
+#: Numbers of the moments of a loop: extrema of x1, and the moments of the diagram, if different.
 EXTREMUM, OWN = 0, 1
-#: Results of `Attractor` that tell where an attractor at rest is.
+#: Results of `Attractor` with the place of an attractor at rest.
 RESTS_AT = ("x1_min", "x2_min")
 
 
 @dataclass(frozen=True)
 class _LoopPoints:
-    """The first moments of a run, `room` of them: t, x1, x2 and the number in `at`. A reducer, see
+    """The first `room` moments of a run: t, x1, x2 and the number in `at`. A reducer, see
     `sweep.sweep`.
 
-    They are kept in pieces of eight: what is larger in all lanes makes a slow kernel.
+    They are kept in pieces of eight: larger arrays in all lanes make a slow kernel.
     """
 
     at: tuple[Any, ...]
@@ -323,5 +460,5 @@ class _LoopPoints:
         }
 
 
-#: What is kept of each moment.
+#: Results for each moment.
 OF_MOMENTS = ("t", "x1", "x2", "number")

@@ -1,4 +1,4 @@
-"""What a sweep is asked: its arguments, checked once, and what makes two sweeps the same."""
+"""The question of a sweep: its arguments, checked once, and what makes two sweeps the same."""
 
 import functools
 import hashlib
@@ -15,6 +15,7 @@ import jax
 import numpy as np
 
 from ..checks import (
+    as_array,
     as_positive,
     as_tolerance,
     in_words,
@@ -25,26 +26,31 @@ from ..checks import (
 )
 from ..identity import fingerprint
 from ..kernel.lanes import Observer, Program
+from ..model.oscillator import has_clock
 from ..spelling import did_you_mean
 from .along import Along
 from .attractor import Attractor
 from .datasets import Table
+from .exponents import Exponents, ForcedAttractor
 from .grid import Grid
 from .moments import AtEvents, checked
 from .observers import Final, Reduce
 from .reducers import check_reducer
 
-#: Default t1 of attractor runs: some 500 loops, where nearly all have long been decided.
+#: Default t1 of attractor runs: some 500 loops; nearly all runs are decided long before.
 LONG_ENOUGH = 30_000.0
-#: The observers that have a name.
+#: Observers that have a name.
 NAMED: dict[str, type[Observer]] = {"final": Final, "attractor": Attractor}
-#: Points of the grid that tell what `make` is, at most; the same on every machine.
+#: And those that have one where the oscillators know the time; attractor runs then end at this t1.
+NAMED_FORCED = NAMED | {"attractor": ForcedAttractor, "lyapunov": Exponents}
+LONG_ENOUGH_FORCED = 2_000.0
+#: Largest number of points of the grid that identify `make`; the same on every machine.
 SAMPLE = 2**14
 
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """A sweep: where, what, and how exactly. numbers: t1, rtol and atol."""
+    """Arguments of a sweep; numbers: t1, rtol and atol."""
 
     grid: Grid
     observe: Any
@@ -52,19 +58,26 @@ class Question:
     derivatives: tuple[str, ...]
 
     @classmethod
-    def of(cls, make, axes, y0, t1, rtol, atol, observe, derivatives) -> "Question":
-        """The arguments of `sweep`, checked."""
+    def of(cls, make, axes, y0, t1, rtol, atol, observe, derivatives, t0=0.0) -> "Question":
+        """Checks the arguments of `sweep`."""
         require_usable_jax()
         grid = Grid(make, axes, y0)
-        _observer(observe)
+        clock = has_clock(grid.example)
+        _observer(observe, clock)
         if t1 is None:
             given = 'given, the end of each run, but for observe="attractor"'
             require(observe == "attractor", "t1", given, "None")
-            t1 = LONG_ENOUGH
+            t1 = LONG_ENOUGH_FORCED if clock else LONG_ENOUGH
         numbers = settings_of_runs(t1, rtol, atol)
+        if clock:
+            numbers["t0"] = as_start(t0, numbers["t1"])
+        else:
+            require(t0 == 0.0, "t0", "0 for an oscillator that does not know the time", t0)
         wanted: Sequence[str] = [derivatives] if isinstance(derivatives, str) else derivatives
         fits = isinstance(wanted, Sequence)
         require_value(fits, "derivatives", "a tuple of names of axes", wanted)
+        none = "none where the oscillators are forced: differentiate jb.simulate"
+        require(not clock or len(wanted) == 0, "derivatives", none, wanted)
         different = len(set(wanted)) == len(wanted)
         require_value(different, "derivatives", "free of repeats", wanted)
         for name in wanted:
@@ -77,15 +90,15 @@ class Question:
         return question
 
     def arguments(self) -> tuple[Any, ...]:
-        """The arguments of `of`: what another process needs to ask the same."""
-        grid, numbers = self.grid, self.numbers.values()
-        start = tuple(grid.y0.values())
-        return grid.make, grid.axes, start, *numbers, self.observe, self.derivatives
+        """The arguments of `of`, for another process that asks the same question."""
+        grid, numbers = self.grid, [self.numbers[name] for name in ("t1", "rtol", "atol")]
+        start, t0 = tuple(grid.y0.values()), self.numbers.get("t0", 0.0)
+        return grid.make, grid.axes, start, *numbers, self.observe, self.derivatives, t0
 
     @functools.cached_property
     def program(self) -> Program:
         """What the kernel is compiled for."""
-        return self.grid.program(_observer(self.observe))
+        return self.grid.program(_observer(self.observe, has_clock(self.grid.example)))
 
     @functools.cached_property
     def table(self) -> Table:
@@ -93,7 +106,7 @@ class Question:
         return Table(self.program, self.grid, self.derivatives)
 
     def attributes(self) -> dict[str, Any]:
-        """What the numbers of a dataset came from."""
+        """Attributes that describe the origin of a dataset."""
         grid, observe = self.grid, self.observe
         start = [f"{axis} = {value}" for axis, value in grid.y0.items() if axis not in grid.axes]
         return {
@@ -111,7 +124,8 @@ class Question:
         }
 
     def _only_one_start(self) -> str:
-        """What is to be known of attractors that are looked for from one start at each point."""
+        """Warning in the attributes if attractors are looked for from only one start at each
+        point."""
         if self.observe != "attractor" or any(name in self.grid.axes for name in ("x1", "x2")):
             return ""
         return (
@@ -120,8 +134,11 @@ class Question:
         )
 
     def call(self) -> str:
-        """How to ask it again, as a line of Python; `dataset` is that of the results, and what
-        cannot be imported goes by its own name, or by `make`."""
+        """The call that asks this question, as a line of Python.
+
+        `dataset` is the dataset of the results; objects that cannot be imported go by their own
+        name, or by `make`.
+        """
         given = {name: value for name, value in self.numbers.items() if value is not None}
         settings = ", ".join(f"{name}={value!r}" for name, value in given.items())
         start, axes = tuple(self.grid.y0.values()), list(self.grid.axes)
@@ -134,54 +151,65 @@ class Question:
         )
 
     def identity(self) -> dict[str, str]:
-        """What makes two sweeps the same, by the names of the arguments.
+        """Identity of the sweep, by the names of the arguments; equal for two sweeps that are the
+        same.
 
-        `make` counts by what it gives, at up to `SAMPLE` points of the grid: its numbers to eleven
-        digits, which do not depend on the machine, and the friction laws of its oscillator by
-        their types, numbers and, if they are not this package's, their fingerprints.
+        `make` counts by what it returns, at up to `SAMPLE` points of the grid: its numbers to
+        eleven digits, which do not depend on the machine, and the friction laws of its oscillator
+        by their types, numbers and, if they are not this package's, their fingerprints.
         """
         grid = self.grid
         sample = np.unique(np.linspace(0, grid.runs - 1, SAMPLE).astype(int))
         rows = grid.rows(sample)
         leaves, _ = jax.tree_util.tree_flatten_with_path(grid.example)
         parameters = [f"{jax.tree_util.keystr(path)}={float(leaf)!r}" for path, leaf in leaves]
-        told = {f"axis {name}": _hash(axis.tobytes()) for name, axis in grid.axes.items()}
-        told["axes"] = ", ".join(f"{name} ({axis.size})" for name, axis in grid.axes.items())
-        told["y0"] = repr(tuple(grid.y0.values()))
-        told["oscillator"] = ", ".join(parameters)
-        told["make"] = _hash(" ".join(f"{x:.10e}" for x in rows.ravel().tolist()).encode())
+        identity = {f"axis {name}": _hash(axis.tobytes()) for name, axis in grid.axes.items()}
+        identity["axes"] = ", ".join(f"{name} ({axis.size})" for name, axis in grid.axes.items())
+        identity["y0"] = repr(tuple(grid.y0.values()))
+        identity["oscillator"] = ", ".join(parameters)
+        identity["make"] = _hash(" ".join(f"{x:.10e}" for x in rows.ravel().tolist()).encode())
         for i, belt in enumerate(grid.example.belts):
             shown = _plain(repr(belt.friction))
             kinds = _kinds_in(belt.friction)
             names = " with ".join(kind.__qualname__ for kind in kinds)
             if not all(map(_is_ours, kinds)):
                 names = f"{names}, {fingerprint(belt.friction, f'the law of belt {i}')}"
-            told[f"the law of belt {i}"] = f"{shown} of {names}"
-        told |= {name: repr(value) for name, value in self.numbers.items()}
-        told["observe"] = repr(self.observe)
+            identity[f"the law of belt {i}"] = f"{shown} of {names}"
+        identity |= {name: repr(value) for name, value in self.numbers.items()}
+        identity["observe"] = repr(self.observe)
         if not isinstance(self.observe, str):
             kind = type(self.observe).__qualname__
-            told["observe"] = f"{kind} {fingerprint(self.observe, 'observe')}"
-        told["derivatives"] = repr(self.derivatives)
-        return told
+            identity["observe"] = f"{kind} {fingerprint(self.observe, 'observe')}"
+        identity["derivatives"] = repr(self.derivatives)
+        return identity
 
 
 def settings_of_runs(t1: Any, rtol: Any, atol: Any) -> dict[str, Any]:
-    """The arguments of runs, checked; atol may be None, for the default in own units."""
+    """Checks the arguments of runs; atol may be None, for the default in own units."""
     positive = {name: as_positive(value, name) for name, value in (("t1", t1), ("rtol", rtol))}
     return {**positive, "atol": as_tolerance(atol, "atol")}
 
 
-def _observer(observe: Any) -> Observer:
+def as_start(t0: Any, t1: float) -> float:
+    """The time at which runs begin, before t1, as a float."""
+    start = float(as_array(t0, "t0"))
+    require_value(np.isfinite(start) and start < t1, "t0", f"a number below t1 = {t1}", t0)
+    return start
+
+
+def _observer(observe: Any, clock: bool) -> Observer:
+    if isinstance(observe, Attractor):
+        require(not clock, "observe", '"attractor" for oscillators that are forced', observe)
     if isinstance(observe, Observer):
         return observe
+    known = NAMED_FORCED if clock else NAMED
     if isinstance(observe, str):
-        require_one_of(observe, NAMED, "observe", " or an object with init, update, finish")
-        return NAMED[observe]()
+        require_one_of(observe, known, "observe", " or an object with init, update, finish")
+        return known[observe]()
     methods = ("init", "update", "finish")
     fits = all(callable(getattr(observe, name, None)) for name in methods)
     fits = fits and not isinstance(observe, type)
-    names = ", ".join(f'"{name}"' for name in NAMED)
+    names = ", ".join(f'"{name}"' for name in known)
     expected = f"{names} or an object with init, update, finish"
     require_value(fits, "observe", expected, observe)
     if hasattr(observe, "at") or hasattr(observe, "rates"):
@@ -192,13 +220,14 @@ def _observer(observe: Any) -> Observer:
 
 @functools.cache
 def _versions() -> str:
-    """Of all that has a say in the numbers; to read one takes a third of a millisecond."""
+    """Versions of all packages that affect the numbers; reading one takes a third of a
+    millisecond."""
     packages = ("jaxbelt", "jax", "jaxlib", "diffrax", "equinox", "numpy", "xarray")
     return ", ".join(f"{name} {importlib.metadata.version(name)}" for name in packages)
 
 
 def _expression(make: Callable) -> str | None:
-    """The function as any program can have it: its full name, or the call that made it."""
+    """The function as any program can write it: its full name, or the call that made it."""
     if isinstance(make, functools.partial):
         function = _expression(make.func)
         given = [*map(_value, make.args), *(f"{k}={_value(v)}" for k, v in make.keywords.items())]
@@ -208,7 +237,7 @@ def _expression(make: Callable) -> str | None:
 
 
 def _text_of(make: Callable) -> str:
-    """The source of a function, with all that stands in its lines, or else its name."""
+    """Source of a function, with all that stands in its lines, or else its name."""
     try:
         return inspect.getsource(make).strip()
     except (OSError, TypeError):
@@ -216,12 +245,12 @@ def _text_of(make: Callable) -> str:
 
 
 def _value(value: Any) -> str:
-    """An argument that was fixed; arrays of one number as that number."""
+    """An argument that was fixed; an array of one number as that number."""
     return repr(float(value)) if np.ndim(value) == 0 and hasattr(value, "dtype") else repr(value)
 
 
 def _kinds_in(module: eqx.Module) -> list[type]:
-    """The class of a module, and those of the modules that it is made of."""
+    """Class of a module, and those of the modules in it."""
     parts = jax.tree.leaves(
         list(vars(module).values()), is_leaf=lambda part: isinstance(part, eqx.Module)
     )

@@ -13,7 +13,7 @@ the events and step is made once, with all of them, see `derivatives.in_directio
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -24,10 +24,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..kernel.events import pass_events
+from ..kernel import clocked, events, rounds, step
 from ..kernel.lanes import Lanes, Observer, Program, are_finite, choose
-from ..kernel.rounds import STEPS_PER_ROUND, lanes_at_start
-from ..kernel.step import take_step, window_of
+from ..kernel.rounds import STEPS_PER_ROUND
+from ..model.oscillator import has_clock
 from ..model.own_units import OwnOscillator, in_units, without_edges
 from ..model.rest import start_at_focus
 from ..numerics.compiling import jit, one_kernel
@@ -60,12 +60,22 @@ def _oscillators(program: Program, shared, rows: tuple[Array, ...]) -> OwnOscill
     return osc if program.edges else without_edges(osc)
 
 
-def _begin(program: Program, osc, run, x1, x2, passes, rtol) -> Lanes:
+def _moves_of(osc: OwnOscillator) -> tuple[Callable, Callable, Callable]:
+    """How lanes go on: `pass_events`, `window_of` and `take_step`, with a clock or without."""
+    if has_clock(osc):
+        return clocked.pass_events, clocked.window_of, clocked.take_step
+    return events.pass_events, step.window_of, step.take_step
+
+
+def _begin(program: Program, osc, run, x1, x2, passes, rtol, t0=None) -> Lanes:
     """Lanes at the start of their runs."""
     x1, x2 = x1 / osc.units.length, x2 / osc.units.length
-    if program.derivatives:
-        x1, x2 = start_at_focus(osc, x1, x2)
-    lanes = lanes_at_start(osc, run, x1, x2, passes, rtol)
+    if has_clock(osc):
+        lanes = clocked.lanes_at_start(osc, run, x1, x2, passes, rtol, t0)
+    else:
+        if program.derivatives:
+            x1, x2 = start_at_focus(osc, x1, x2)
+        lanes = rounds.lanes_at_start(osc, run, x1, x2, passes, rtol)
     memory, integrals = program.observer.start(osc, lanes), program.observer.integrals(osc, lanes)
     return replace(lanes, memory=memory, integrals=integrals)
 
@@ -86,7 +96,8 @@ def idle(program: Program, shared, width: int, columns: int) -> Stream:
     rows = tuple(jnp.zeros(width) for _ in range(columns))
     osc = _oscillators(program, shared, rows)
     run = jnp.full(width, -1, dtype=jnp.int32)
-    lanes = _begin(program, osc, run, rows[0], rows[1], jnp.zeros((), jnp.int32), jnp.ones(()))
+    start = rows[0], rows[1], jnp.zeros((), jnp.int32), jnp.ones(()), 0.0
+    lanes = _begin(program, osc, run, *start)
     lanes = eqx.tree_at(lambda n: n.done, lanes, jnp.ones(width, dtype=bool))
     stream = Stream(lanes, rows, jnp.zeros((), jnp.int32), jnp.ones(width))
     # Of types such as the kernel gives back: weak ones of a reducer would have it compiled twice.
@@ -140,7 +151,8 @@ class Common(eqx.Module):
     """What all runs of a call have in common.
 
     shared: the leaves of the oscillator that do not differ from run to run; t1; rtol; atol: in the
-    units in which runs are given, NaN for the default; limit: how many passes a run may take.
+    units in which runs are given, NaN for the default; limit: how many passes a run may take. t0:
+    where all begin, of those that know the time; None: at 0.
     """
 
     shared: list[Array]
@@ -148,6 +160,7 @@ class Common(eqx.Module):
     rtol: Any
     atol: Any
     limit: Any
+    t0: Any = None
 
 
 class _Block(eqx.Module):
@@ -210,7 +223,8 @@ def _refill(program: Program, common: Common, block: _Block, desk: _Desk) -> _De
     pairs = zip(block.rows, desk.stream.rows, strict=True)
     rows = tuple(jnp.where(takes, column[place], row) for column, row in pairs)
     osc = _oscillators(program, common.shared, rows)
-    fresh = _begin(program, osc, block.first + place, rows[0], rows[1], passes, common.rtol)
+    numbers = passes, common.rtol, common.t0
+    fresh = _begin(program, osc, block.first + place, rows[0], rows[1], *numbers)
     lanes = choose(takes, fresh, replace(lanes, run=jnp.where(free, -1, lanes.run)))
     return _Desk(
         Stream(lanes, rows, passes + 1, ones),
@@ -226,18 +240,19 @@ def _work(program: Program, common: Common, stream: Stream, slopes: Sequence[Str
     its derivatives, one for each direction."""
     observer, ones = program.observer, stream.ones
     t1, rtol = common.t1, common.rtol
-    forward = functools.partial(take_step, derivatives=program.derivatives)
     rules = dict(captures=program.captures, derivatives=program.derivatives)
 
     def begin(rows, lanes):
         osc = _oscillators(program, common.shared, rows)
+        pass_events, window_of, _ = _moves_of(osc)
         lanes, passage = pass_events(osc, lanes, t1, rtol, **rules)
         lanes = observer.watch(osc, lanes, passage, ones, t1, rtol)
         return lanes, window_of(osc, lanes, extrema=observer.extrema(lanes))
 
-    def step(rows, lanes, window):
+    def go(rows, lanes, window):
         osc = _oscillators(program, common.shared, rows)
         atol = in_units(common.atol, osc.units.length, DEFAULT_TOLERANCE)
+        forward = functools.partial(_moves_of(osc)[2], derivatives=program.derivatives)
         return observer.follow(forward, osc, window, ones, lanes, t1, rtol, atol)
 
     rows, rows_slopes = stream.rows, [one.rows for one in slopes]
@@ -250,7 +265,7 @@ def _work(program: Program, common: Common, stream: Stream, slopes: Sequence[Str
         def go_on(_, state):
             lanes, own = state
             begun = [(r, one, w) for r, one, (_, w) in zip(rows_slopes, own, slopes, strict=True)]
-            return in_directions(step, (rows, lanes, window), begun, _floats_of_lanes)
+            return in_directions(go, (rows, lanes, window), begun, _floats_of_lanes)
 
         return lax.fori_loop(0, STEPS_PER_ROUND, go_on, (lanes, [one for one, _ in slopes]))
 

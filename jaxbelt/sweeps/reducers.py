@@ -1,4 +1,4 @@
-"""Whether a reducer of the user's own is one: its methods are tried on shapes, before any run."""
+"""Checks of a user's reducer: its methods are tried on shapes, before any run."""
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
@@ -10,18 +10,20 @@ import jax.numpy as jnp
 from ..checks import require, shape_in_words
 from ..model.oscillator import Oscillator
 from .along import Motion
-from .moments import AtSection, checked
+from .moments import AtSection, check_moments, checked
 from .observers import RunEnd, RunEvent
 
 
 def check_reducer(reducer: Any, osc: Oscillator) -> None:
-    """Raise a `ValueError` that names the method of `observe` which is not as `sweep` says."""
+    """Raises a `ValueError` that names the method of `observe` that is not as `sweep` describes
+    it."""
     number, code = jax.ShapeDtypeStruct((), jnp.float64), jax.ShapeDtypeStruct((), jnp.int64)
     moment = integrals = None
     if hasattr(reducer, "at") or hasattr(reducer, "rates"):
         moment = code
     if hasattr(reducer, "at"):
         check_sections(checked(reducer.at), osc)
+        check_moments(reducer.at, osc)
     if hasattr(reducer, "rates"):
         forces = jax.ShapeDtypeStruct((len(osc.belts),), jnp.float64)
         motion = jax.eval_shape(Motion, number, number, number, number, forces)
@@ -46,7 +48,7 @@ def check_reducer(reducer: Any, osc: Oscillator) -> None:
 
 
 def check_sections(moments: Sequence[Any], osc: Oscillator) -> None:
-    """Raise a `ValueError` unless the function of each `AtSection` gives one number."""
+    """Raises a `ValueError` unless the function of each `AtSection` returns one number."""
     number = jax.ShapeDtypeStruct((), jnp.float64)
     for one in moments:
         if isinstance(one, AtSection):
@@ -59,12 +61,12 @@ def check_sections(moments: Sequence[Any], osc: Oscillator) -> None:
 
 
 def _tried(name: str, arguments: str, method: Callable, *args: Any) -> Any:
-    """The shapes of what a method gives."""
+    """Shapes of what a method returns."""
     return _shape_of(f"observe.{name}", f"a method of {arguments}", method, *args)
 
 
 def _shape_of(field: str, kind: str, function: Callable, *args: Any) -> Any:
-    """The shapes of what a function gives, or a `ValueError` on the field that it came from."""
+    """Shapes of what a function returns, or a `ValueError` that names its field."""
     try:
         return jax.eval_shape(function, *args)
     except Exception as error:

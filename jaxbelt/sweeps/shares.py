@@ -1,8 +1,9 @@
-"""Which attractors there are: what a sweep over several starts says at each point of the others.
+"""The attractors of a sweep over several starts, with their shares, at each point of the other
+axes.
 
-`attractors` takes the dataset of a sweep with `x1` or `x2` among its axes and puts, in the place of
-the starts, an axis of attractors, each with the fraction of the starts that lead to it.
-`told_apart` tells apart what the starts at one point lead to.
+`attractors` takes the dataset of a sweep with `x1` or `x2` among its axes and replaces the starts
+by an axis of attractors, each with the fraction of the starts that lead to it.
+`numbers_of_attractors` decides which runs at one point lead to the same attractor.
 """
 
 from collections.abc import Callable
@@ -26,9 +27,9 @@ from .datasets import check_dataset
 if TYPE_CHECKING:
     import xarray
 
-#: Starts that are compared at once, at most.
+#: Largest number of starts that are compared at once.
 AT_ONCE = 2**18
-#: Variables of a sweep that say nothing of an attractor.
+#: Variables of a sweep that do not describe an attractor.
 OF_RUNS = ("transient", "status")
 #: Coordinates that are no arguments of the function of the sweep.
 NO_PARAMETERS = ("x1", "x2", "belt")
@@ -38,25 +39,33 @@ NO_PARAMETERS = ("x1", "x2", "belt")
 def attractors(
     dataset: "xarray.Dataset", make: Callable[..., Oscillator] | None = None
 ) -> "xarray.Dataset":
-    """The attractors at each point of a sweep, the one that most starts lead to first.
+    """The attractors at each point of a sweep, in the order of their fractions of starts.
 
-    dataset: of `sweep(..., observe="attractor")` with `x1`, `x2` or both among its axes. make: the
-    function that the sweep was of; only cycles that are very near to one another need it.
-    Returns a dataset over the other axes and `attractor`: fraction, of the starts that lead there,
-    and kind, signature, sticks, period, stick_duration, n_events and the extrema, of one of its
-    runs. Where there are fewer attractors than elsewhere fraction is 0 and kind is undecided. What
-    fractions lack to 1 are runs that were undecided.
+    Two runs lead to one cycle if they agree in events, extrema and period, to a thousand times the
+    tolerance of the sweep; to one equilibrium if it is at the same place; a mass that is stuck for
+    ever has one attractor for each set of belts. Cycles that differ by more than that, but by less
+    than a hundredth of their size, may be one that attracts weakly, or several: shooting decides,
+    and cycles that it does not find are undecided.
 
-    Two runs lead to one cycle if it has the same events, extrema and period, to a thousand times
-    the tolerance of the sweep; to one equilibrium if it is at the same place; what is stuck for
-    ever is one attractor for each set of belts. Cycles that differ by more than that, but by less
-    than a hundredth of their size, may be one that attracts weakly, or several: shooting tells, and
-    what it does not find is undecided. `ValueError` where it is needed and `make` is not given.
+    Args:
+        dataset: From `sweep(..., observe="attractor")` with `x1`, `x2` or both among its axes.
+        make: The function of the sweep; only cycles that are very near to one another need it.
+
+    Returns:
+        A dataset over the other axes and `attractor`. Its variables are fraction, of the starts
+        that lead there, and kind, signature, sticks, period, stick_duration, n_events and the
+        extrema, of one of its runs. Where there are fewer attractors than elsewhere the fraction
+        is 0 and the kind undecided. Fractions add up to 1 minus the share of undecided runs.
+
+    Raises:
+        ValueError: If the dataset is not of such a sweep, or if `make` is needed and not given.
     """
     check_dataset(dataset)
     require("kind" in dataset, "dataset", 'that of sweep(..., observe="attractor")', "one without")
-    left = int(np.sum(dataset["kind"].values < UNDECIDED))
-    require(not left, "dataset", "of a sweep that is done", f"one with {left:,} runs not done")
+    missing = int(np.sum(dataset["kind"].values < UNDECIDED))
+    require(
+        not missing, "dataset", "of a sweep that is done", f"one with {missing:,} runs not done"
+    )
     if make is not None:
         require_callable(make, "make", "the function of the sweep")
     starts = [name for name in ("x1", "x2") if name in dataset.kind.dims]
@@ -69,13 +78,13 @@ def attractors(
     count = int(labels.max(initial=0)) + 1
     numbers = np.arange(count)
     fractions = np.mean(labels[..., None] == numbers, axis=-2)
-    # The first run of each attractor; where there is none, any.
+    # The first run of each attractor; where there is none, any run.
     first = np.argmax(labels[..., None] == numbers, axis=-2)
     ranks = np.argsort(-fractions, axis=-1, kind="stable")
     fractions, first = (np.take_along_axis(part, ranks, axis=-1) for part in (fractions, first))
     coordinates: dict[str, Any] = {name: dataset.coords[name] for name in others}
-    told = {"long_name": "fraction of the starts that lead there"}
-    variables: dict[str, Any] = {"fraction": ((*others, "attractor"), fractions, told)}
+    attributes = {"long_name": "fraction of the starts that lead there"}
+    variables: dict[str, Any] = {"fraction": ((*others, "attractor"), fractions, attributes)}
     for name, one in dataset.items():
         if name in OF_RUNS or not set(order) <= set(one.dims):
             continue
@@ -93,12 +102,12 @@ def attractors(
 
 
 def _nothing(dtype: np.dtype) -> np.ndarray:
-    """What stands for an attractor that is not there."""
+    """Value of a variable for an attractor that does not exist."""
     return np.asarray(np.nan if np.issubdtype(dtype, np.floating) else 0, dtype)
 
 
 def _runs_by_points(dataset: "xarray.Dataset", others: list[str], starts: list[str]) -> Runs:
-    """What the runs tell, [points, starts]."""
+    """Results of the runs, [points, starts]."""
     runs = Runs.of(dataset, (*others, *starts))
     shape = -1, int(np.prod([dataset.sizes[name] for name in starts]))
     return replace(
@@ -126,13 +135,13 @@ def _labels_of_starts(
 def _labels_of(kinds: np.ndarray, sticks: np.ndarray, runs: Runs) -> np.ndarray:
     """Numbers of the attractors, [points, starts], or -1.
 
-    The first start that has no number yet is compared with all others.
+    The first start without a number is compared with all others, again and again.
     """
     labels, number = np.full(kinds.shape, -1), 0
-    untold = kinds != UNDECIDED
+    unnumbered = kinds != UNDECIDED
     rows = np.arange(len(kinds))
-    while np.any(untold):
-        there = rows[:, None], np.argmax(untold, axis=1)[:, None]
+    while np.any(unnumbered):
+        there = rows[:, None], np.argmax(unnumbered, axis=1)[:, None]
         same = kinds == kinds[there]
         first = runs.at(there)
         middle = np.abs(runs.places[..., 0] - first.places[..., 0])
@@ -140,28 +149,34 @@ def _labels_of(kinds: np.ndarray, sticks: np.ndarray, runs: Runs) -> np.ndarray:
         stuck = np.all(sticks == sticks[there], axis=-1)
         rests = np.where(kinds == EQUILIBRIUM, rests, stuck)
         same &= np.where(kinds == CYCLE, runs.same(first)[0], rests)
-        labels[same & untold & untold[there]] = number
-        untold &= ~same
+        labels[same & unnumbered & unnumbered[there]] = number
+        unnumbered &= ~same
         number += 1
     return labels
 
 
-def told_apart(
+def numbers_of_attractors(
     kinds: np.ndarray, sticks: np.ndarray, runs: Runs, oscillator: Callable[[int], Oscillator]
 ) -> np.ndarray:
-    """Numbers of what the runs at each point lead to, [points, runs], in the order in which they
-    are met, or -1.
+    """Numbers of the attractors of the runs at each point, in the order in which they are met, or
+    -1.
 
-    kinds: codes, [points, runs]; sticks: whatever else tells apart what is stuck for ever, [points,
-    runs, ..]; oscillator: gives that of a point, where shooting has to tell.
+    Args:
+        kinds: Codes, [points, runs].
+        sticks: What else distinguishes masses that are stuck for ever, [points, runs, ..].
+        runs: Places of the attractors.
+        oscillator: Returns the oscillator of a point, where shooting has to decide.
+
+    Returns:
+        The numbers, [points, runs].
     """
     labels = _labels_of(kinds, sticks, runs)
     for point, pairs in _doubts(kinds, labels, runs).items():
-        labels[point] = _settled(oscillator(point), labels[point], runs.places[point], pairs)
+        labels[point] = _decided(oscillator(point), labels[point], runs.places[point], pairs)
     return labels
 
 
-# --- cycles that the runs do not tell apart -------------------------------------------------------
+# --- cycles that the runs do not distinguish ------------------------------------------------------
 
 
 def _without_doubt(
@@ -171,7 +186,7 @@ def _without_doubt(
     starts: list[str],
     labels: np.ndarray,
 ) -> np.ndarray:
-    """The numbers of `_labels_of_starts`, where shooting has told which are of one cycle."""
+    """The numbers of `_labels_of_starts`, where shooting has decided which are of one cycle."""
     runs = _runs_by_points(dataset, others, starts)
     flat = labels.reshape(runs.signatures.shape).copy()
     kinds = dataset["kind"].transpose(*others, *starts).values.reshape(flat.shape)
@@ -193,32 +208,32 @@ def _without_doubt(
         osc = in_own_units(
             make(**{name: float(here[name]) for name in given}), np.asarray(dataset.attrs["length"])
         )
-        flat[point] = _settled(osc, flat[point], runs.places[point], pairs)
+        flat[point] = _decided(osc, flat[point], runs.places[point], pairs)
     return flat.reshape(labels.shape)
 
 
-def _settled(
+def _decided(
     osc: Oscillator, labels: np.ndarray, places: np.ndarray, pairs: list[tuple[int, int]]
 ) -> np.ndarray:
-    """The numbers at a point, where shooting tells which of the pairs are one."""
-    cycles, settled = {}, labels.copy()
+    """The numbers at a point after shooting has decided which of the pairs are one cycle."""
+    cycles, decided = {}, labels.copy()
     for number in sorted({number for pair in pairs for number in pair}):
         # From where the cycle turns back: there it is known best.
         x1_max = places[np.argmax(labels == number), 1]
         cycles[number] = cycle_from(osc, jnp.asarray(np.array([x1_max, 0.0])))
         if int(cycles[number].status) != Status.OK or not bool(cycles[number].stable):
-            settled[labels == number] = -1
+            decided[labels == number] = -1
     for one, other in pairs:
         if is_same(cycles[one], cycles[other]):
-            first, second = (settled[np.argmax(labels == number)] for number in (one, other))
-            settled[settled == second] = first
-    known = settled >= 0
-    settled[known] = np.unique(settled[known], return_inverse=True)[1]
-    return settled
+            first, second = (decided[np.argmax(labels == number)] for number in (one, other))
+            decided[decided == second] = first
+    known = decided >= 0
+    decided[known] = np.unique(decided[known], return_inverse=True)[1]
+    return decided
 
 
 def _doubts(kinds: np.ndarray, labels: np.ndarray, runs: Runs) -> dict[int, list[tuple[int, int]]]:
-    """The points at which runs leave open whether two numbers are of one cycle, and which."""
+    """For each point the pairs of numbers that may belong to one cycle."""
     rows = np.arange(len(labels))
     numbers = range(int(labels.max(initial=-1)) + 1)
     there = [(rows, np.argmax(labels == number, axis=1)) for number in numbers]

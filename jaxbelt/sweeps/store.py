@@ -1,16 +1,17 @@
 """Stores: the results of a sweep in a Zarr group that grows block by block and survives its writer.
 
 A store is a folder that `xarray.open_zarr` opens: variables over the axes, with units and long
-names. One block of runs is one chunk of every variable, so no two writers meet in a chunk, and what
-a block holds does not depend on when or where it was done. Beside the variables the group `ledger`
-holds
+names. One block of runs is one chunk of every variable, so no two writers meet in a chunk, and the
+content of a block does not depend on when or where it was computed. Beside the variables the group
+`ledger` holds
 
-- `blocks`, a row a block: its state (0 to do, 1 done), a checksum of its data, how often and in how
-  many seconds it was done. The row is written after the data, in a write of its own, so that no
-  block is called done that is not, whenever the writer dies;
+- `blocks`, a row for each block: its state (0 to do, 1 done), a checksum of its data, how often and
+  in how many seconds it was done. The row is written after the data, in a separate write, so that
+  no block is marked as done that is not, whenever the writer dies;
 - the codes of categories that are numbered when all runs are done, see `lanes.Variable.name_of`.
 
-The attributes of the group say what was asked; a sweep that asks anything else is refused.
+The attributes of the group contain the question of the sweep; a sweep with another question is
+refused.
 """
 
 import hashlib
@@ -44,18 +45,18 @@ if TYPE_CHECKING:
 
 #: Version of the layout described above.
 SCHEMA = 3
-#: Runs in a block, at most: few enough that not much is lost with one.
+#: Largest number of runs in a block: few enough that not much is lost with one.
 BLOCK_RUNS = 2**17
-#: Blocks of a smaller sweep, whose runs may be long ones (each takes some 40 ms to write), and how
-#: many runs they have at least.
+#: Number of blocks of a smaller sweep, whose runs may be long (writing a block takes some 40 ms),
+#: and the least number of runs in a block.
 FEW_BLOCKS, LEAST_RUNS = 8, 64
-#: The columns of the ledger, and the states of a block.
+#: Columns of the ledger, and states of a block.
 STATE, CHECKSUM, TIMES_DONE, SECONDS = range(4)
 TO_DO, DONE = 0, 1
 
 
 def blocks_of(grid: Grid) -> Blocks:
-    """The blocks of a grid in a store that is new."""
+    """The blocks of a grid in a new store."""
     return Blocks(grid.shape, _block_runs(grid))
 
 
@@ -65,10 +66,10 @@ def _block_runs(grid: Grid) -> int:
 
 @dataclass
 class _Waiting:
-    """A block of which some runs are done: its variables, and how many runs are left."""
+    """A block of which some runs are done: its variables, and how many runs are missing."""
 
     parts: dict[str, np.ndarray]
-    left: int
+    missing: int
 
 
 class Store:
@@ -79,9 +80,9 @@ class Store:
     def opened(
         cls, path: Path, question: Question, part: tuple[int, int] | None = None
     ) -> "Iterator[Store]":
-        """The store of a sweep, made where there is none, and locked unless it is finished.
+        """Opens the store of a sweep, creates it if necessary, and locks it unless it is finished.
 
-        part: the first block that is wanted, and the one behind the last; None: all of them.
+        part: the first block to do, and the one behind the last; None: all blocks.
         """
         if _is_finished(path):
             yield cls(path, question, part)
@@ -101,14 +102,14 @@ class Store:
 
     @classmethod
     def finish_if_done(cls, path: Path, question: Question) -> "Store":
-        """The store as it stands when a part is done; finished if that was the last one."""
+        """Reads the store after a part is done; finishes it if that was the last one."""
         store = cls(path, question)
         if store.to_do or store.finished:
             return store
         try:
             with cls.opened(path, question) as store:
                 store.finish()
-        except BlockingIOError:  # by who does another part again, or finishes it
+        except BlockingIOError:  # by a process that does another part again, or finishes the store
             pass
         return store
 
@@ -119,7 +120,7 @@ class Store:
         part: tuple[int, int] | None = None,
         known: str | None = None,
     ):
-        """known: the hash of the question, where another process compared all of it."""
+        """known: hash of the question, where another process compared all of it."""
         self.path, self.question, self.table = path, question, question.table
         self.root = _open(path)
         self.hash = self.root.attrs["jaxbelt_hash"]
@@ -139,20 +140,20 @@ class Store:
         self.began = time.monotonic()
 
     def is_done(self, block: int) -> bool:
-        """Whether a block is done, as far as is known here."""
+        """Whether a block is done, by the rows that were read last."""
         return bool(self.rows[block, STATE] == DONE)
 
-    def look(self, *blocks: int) -> None:
-        """Read the rows of blocks that other processes may have written."""
+    def read_rows(self, *blocks: int) -> None:
+        """Reads the rows of blocks that other processes may have written."""
         for block in blocks:
             self.rows[block] = np.asarray(self.ledger["blocks"][block])
 
     def statuses(self, block: int) -> np.ndarray:
-        """How the runs of a block ended."""
+        """Statuses of the runs of a block."""
         return np.asarray(self.arrays["status"][self.blocks.slices(block)])
 
     def put(self, block: int, positions: np.ndarray, results: np.ndarray) -> None:
-        """Take results of runs; those of a block are written when they are complete."""
+        """Takes results of runs; a block is written when it is complete."""
         parts, size = self.table.parts(results), self.blocks.size(block)
         with self.lock:
             if block not in self.waiting:
@@ -161,8 +162,8 @@ class Store:
             waiting = self.waiting[block]
             for name, part in parts.items():
                 waiting.parts[name][positions] = part
-            waiting.left -= len(positions)
-            if waiting.left:
+            waiting.missing -= len(positions)
+            if waiting.missing:
                 return
             del self.waiting[block]
         self._write(block, waiting.parts)
@@ -180,15 +181,15 @@ class Store:
 
     @property
     def runs(self) -> int:
-        """How many runs the wanted blocks have."""
+        """Number of runs in the blocks to do."""
         return sum(map(self.blocks.size, self.part))
 
     def done(self) -> int:
-        """How many of them are in the store."""
+        """Number of these that are in the store."""
         return sum(self.blocks.size(block) for block in self.part if self.is_done(block))
 
     def interrupted(self) -> str:
-        """What becomes of the results of an interrupted sweep."""
+        """Says what becomes of the results of an interrupted sweep."""
         done = f"{self.done():,} of {self.runs:,} runs"
         return f"interrupted: {done} are in {self.path}; the same call goes on from there"
 
@@ -208,7 +209,7 @@ class Store:
         return found
 
     def finish(self) -> None:
-        """Number the categories whose codes are all known, and call the store finished."""
+        """Numbers the categories whose codes are all known, and marks the store as finished."""
         if self.finished:
             return
         for name in self.table.numbered():
@@ -226,13 +227,13 @@ class Store:
         _sweep_out(self.path)
         self.ledger.attrs["finished"] = self.finished = True
 
-    def tell(self, attributes: dict[str, Any]) -> None:
-        """Add attributes to the dataset."""
+    def add_attributes(self, attributes: dict[str, Any]) -> None:
+        """Adds attributes to the dataset."""
         self.root.attrs.update(attributes)
         _consolidate(self.path)
 
     def dataset(self) -> "xarray.Dataset":
-        """The dataset in the store, which is read where it is used."""
+        """The dataset in the store; its data are read when they are used."""
         import xarray
 
         return xarray.open_zarr(self.path, chunks=None)
@@ -242,7 +243,7 @@ class Store:
 
 
 def _open(path: Path, mode: Any = "r+") -> Any:
-    """The group of a store, checked for its schema."""
+    """Opens the group of a store and checks its schema."""
     import zarr
 
     expected = "a folder that is empty or holds the store of a sweep"
@@ -261,20 +262,20 @@ def _open(path: Path, mode: Any = "r+") -> Any:
 
 
 def _consolidate(path: Path) -> None:
-    """Copy all metadata to one place, where xarray looks for them first."""
+    """Copies all metadata to one place, where xarray looks for them first."""
     import zarr
 
     with warnings.catch_warnings():
-        # That this is not yet in the specification; others then read the metadata one by one.
+        # Zarr warns that this is not yet in the specification; other readers ignore it.
         warnings.simplefilter("ignore")
         zarr.consolidate_metadata(path)
 
 
 def _array(root: Any, name: str, numbered: bool = False) -> Any:
-    """The array of a variable; of one that is numbered, that of its codes or its numbers."""
+    """Array of a variable; for one that is numbered, that of its codes or its numbers."""
     codes = f"{name}_codes"
     array = root["ledger"][codes] if codes in root["ledger"] and not numbered else root[name]
-    # A chunk that is all NaN, say, has to be there to be known as done.
+    # A chunk of NaN only has to be written, too, to count as done.
     return array.with_config({"write_empty_chunks": True})
 
 
@@ -283,7 +284,7 @@ def _is_finished(path: Path) -> bool:
 
 
 def _check_folder(path: Path) -> None:
-    """Raise unless a store can be written there."""
+    """Raises unless a store can be written there."""
     with _writes(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.exists() and not (path / "zarr.json").exists():
@@ -295,7 +296,7 @@ def _check_folder(path: Path) -> None:
 
 @contextmanager
 def _writes(path: Path) -> Iterator[None]:
-    """Let an error of the system say that it was the store that could not be written."""
+    """Makes an error of the system say that the store could not be written."""
     try:
         yield
     except BlockingIOError:
@@ -306,13 +307,13 @@ def _writes(path: Path) -> Iterator[None]:
 
 
 def _sweep_out(path: Path) -> None:
-    """Remove what writers left that died."""
-    for left in path.rglob("*.partial"):
-        left.unlink(missing_ok=True)
+    """Removes files of writers that died."""
+    for partial in path.rglob("*.partial"):
+        partial.unlink(missing_ok=True)
 
 
 def _create(path: Path, question: Question) -> None:
-    """An empty store, which appears in its place when it is complete."""
+    """Creates an empty store, which appears in its place when it is complete."""
     import xarray
     import zarr
 
@@ -338,14 +339,17 @@ def _create(path: Path, question: Question) -> None:
         group.create_array(name, dtype=dtype, fill_value=fill, **options)
 
     for name in table.shapes:
-        told = {"dimension_names": table.dims(name), "attributes": _as_json(table.attributes(name))}
+        described = {
+            "dimension_names": table.dims(name),
+            "attributes": _as_json(table.attributes(name)),
+        }
         dtype, fill = table.variable(name).dtype, table.empty(name)
         if name in numbered:
             allocate(ledger, f"{name}_codes", dtype, fill)
             dtype, fill = NUMBERED, -1
         fill = np.nan if np.issubdtype(np.dtype(dtype), np.floating) else fill
-        allocate(root, name, dtype, fill, **told)
-    # A chunk a row, for two threads may write theirs at once.
+        allocate(root, name, dtype, fill, **described)
+    # One chunk for each row, as two threads may write theirs at once.
     shape = (len(blocks), 4)
     ledger.create_array("blocks", shape=shape, chunks=(1, 4), dtype="float64", fill_value=0)
     ledger.attrs.update(
@@ -365,7 +369,7 @@ def _ledger_rows(path: Path, ledger: Any) -> np.ndarray:
     """The ledger's rows of all blocks."""
     try:
         return np.array(ledger["blocks"][:])
-    except Exception as error:  # whatever a codec makes of bytes that are not its own
+    except Exception as error:  # whatever a codec raises for bytes that are not its own
         raise ValueError(
             f"store must have a ledger that can be read, got a harmed one in {path} ({error}); "
             f"`jaxbelt verify {path} --repair` finds what is left of it"
@@ -377,20 +381,21 @@ def _identity(question: Question, blocks: Blocks) -> dict[str, str]:
 
 
 def _check_question(path: Path, root: Any, question: Question) -> None:
-    """Raise unless the store is of this very sweep, and name what differs."""
+    """Raises unless the store is of this very sweep, and names what differs."""
     there = json.loads(root.attrs["jaxbelt_question"])
     # A store keeps the blocks that it was made with.
     here = _identity(question, Blocks(question.grid.shape, root["ledger"].attrs["block"]))
     for name in dict.fromkeys([*there, *here]):
         axis = name.removeprefix("axis ")
         if axis != name and not (name in there and name in here):
-            continue  # told by what differs in their list, "axes"
+            continue  # the difference of their list, "axes", is reported
         if here.get(name) != there.get(name):
             if axis != name and axis in question.grid.axes and axis in root:
                 pair = root[axis][:].tolist(), question.grid.axes[axis].tolist()
             else:
                 pair = [str(there.get(name))], [str(here.get(name))]
-                if max(map(len, pair[0] + pair[1])) > 80:  # the leaves of an oscillator, say
+                # the leaves of an oscillator, for example
+                if max(map(len, pair[0] + pair[1])) > 80:
                     pair = pair[0][0].split(", "), pair[1][0].split(", ")
             raise ValueError(
                 f"store must be an empty folder or the store of this very sweep, got that of "
@@ -399,11 +404,11 @@ def _check_question(path: Path, root: Any, question: Question) -> None:
 
 
 def _first_difference(there: Sequence[Any], here: Sequence[Any]) -> str:
-    """Where two rows differ first, and how many entries do, if that can be told in short."""
+    """Describes where two rows differ first, and in how many entries, if that is short."""
     different = [i for i, (old, new) in enumerate(zip(there, here)) if old != new]
     if len(there) != len(here):
         pair = f"{len(there)} entries there", f"{len(here)} here"
-    elif not different:  # but for the sign of a zero, say
+    elif not different:  # equal but for the sign of a zero, for example
         return ""
     else:
         more = f" and {len(different) - 1} more" if len(different) > 1 else ""
@@ -412,12 +417,12 @@ def _first_difference(there: Sequence[Any], here: Sequence[Any]) -> str:
 
 
 def _as_json(attributes: dict[str, Any]) -> dict[str, Any]:
-    """Attributes as JSON has them."""
+    """Attributes as JSON."""
     return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in attributes.items()}
 
 
 def _checksum(parts: Any) -> float:
-    """CRC-32 of the bytes of a block's variables, one after another."""
+    """CRC-32 of the bytes of a block's variables, in order."""
     total = 0
     for part in parts:
         total = zlib.crc32(np.asarray(part).tobytes(), total)
@@ -429,9 +434,13 @@ def _checksum(parts: Any) -> float:
 
 @dataclass(frozen=True)
 class Verified:
-    """What `verify` found: numbers of blocks that are done and right, to do, and bad.
+    """Blocks of a store by state; what `verify` returns.
 
-    finished: whether all blocks are right and the categories numbered.
+    Attributes:
+        done: Numbers of blocks that are done and right.
+        to_do: Numbers of blocks that are not done.
+        bad: Numbers of blocks whose data are not what was written.
+        finished: Whether all blocks are right and the categories numbered.
     """
 
     done: tuple[int, ...]
@@ -440,15 +449,22 @@ class Verified:
     finished: bool
 
     def table(self) -> "pandas.DataFrame":
-        """A row for each block, in order: block, state ("right", "to do" or "bad")."""
+        """Returns a row for each block, in order; columns: block, state ("right", "to do" or
+        "bad")."""
         named = {"right": self.done, "to do": self.to_do, "bad": self.bad}
         pairs = sorted((block, state) for state, blocks in named.items() for block in blocks)
         blocks, states = [block for block, _ in pairs], [state for _, state in pairs]
         return table_of({"block": np.array(blocks, int), "state": np.array(states, str)})
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw the blocks in rows, coloured by their states, into the axes `ax` (None: new ones),
-        which are returned."""
+        """Draws the blocks in rows, coloured by their states.
+
+        Args:
+            ax: Axes; None makes new ones.
+
+        Returns:
+            The axes.
+        """
         return draw(self, ax)
 
     def __repr__(self) -> str:
@@ -460,11 +476,19 @@ class Verified:
 
 
 def verify(path: str | Path, repair: bool = False) -> Verified:
-    """Whether the data in a store are what was written: checksums of all blocks, computed again.
+    """Checks whether the data in a store are what was written: all checksums are computed again.
 
-    path: of a store that `sweep` wrote. repair: mark bad blocks as to do, so that the call that
-    made the store does them again. `ValueError` if there is no store that this version knows,
-    `OSError` if a sweep is writing it and `repair` is wanted.
+    Args:
+        path: Folder of a store that `sweep` wrote.
+        repair: Whether to mark bad blocks as to do, so that the call that made the store does them
+            again.
+
+    Returns:
+        The blocks by state, `Verified`.
+
+    Raises:
+        ValueError: If there is no store that this version knows.
+        OSError: If a sweep is writing it and `repair` is set.
     """
     path = as_path(path, "path")
     require_value(isinstance(repair, bool), "repair", "True or False", repair)
@@ -496,7 +520,7 @@ def _verified(root: Any) -> Verified:
 
 
 def _state(root, ledger, arrays, block: int, place: tuple[slice, ...], finished: bool) -> str:
-    """Of a block: done, to do or bad."""
+    """State of a block: done, to do or bad."""
     try:
         row = np.asarray(ledger["blocks"][block])
         if row[STATE] == TO_DO and not finished:
@@ -509,5 +533,5 @@ def _state(root, ledger, arrays, block: int, place: tuple[slice, ...], finished:
             shown = np.asarray(_array(root, name, numbered=True)[place])
             right = right and np.array_equal(renumber(codes, numbers), shown)
         return "done" if right else "bad"
-    except Exception:  # whatever a codec makes of bytes that are not its own
+    except Exception:  # whatever a codec raises for bytes that are not its own
         return "bad"

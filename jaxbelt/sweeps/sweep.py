@@ -1,8 +1,7 @@
 """Sweeps: named axes in, a labelled `xarray.Dataset` out.
 
 `sweep` runs an oscillator from every point of a grid of parameters and starts, on all cores, and
-puts the results where they belong, in memory or in a store. `explain` says beforehand how much that
-is.
+returns the results in memory or in a store. `explain` estimates size and time beforehand.
 """
 
 import dataclasses
@@ -32,6 +31,7 @@ from .along import Along
 from .audit import chosen, differing
 from .clusters import check_executor, do_on_cluster
 from .datasets import Memory
+from .exponents import Exponents
 from .observers import Reduce
 from .progress import SweepProgress
 from .question import Question
@@ -51,6 +51,7 @@ def sweep(
     *,
     y0: ArrayLike | tuple = (3.0, 0.0),
     t1: ArrayLike | None = None,
+    t0: ArrayLike = 0.0,
     rtol: ArrayLike = 1e-8,
     atol: ArrayLike | None = None,
     observe: Any = "final",
@@ -61,64 +62,84 @@ def sweep(
     progress: bool | None = None,
     audit: float = 0.0,
 ) -> "xarray.Dataset":
-    """Run an oscillator from every point of a grid of parameters and starts.
+    """Runs an oscillator from every point of a grid of parameters and starts.
 
-    make: a function of parameters that returns an `Oscillator`, such as `jb.presets.class_b`; the
-    rest of its arguments can be fixed by `functools.partial`. It is called with traced arrays.
-    axes: values, shape [n], of arguments of `make`, and of `x1` and `x2` for starts. NaN, and
-    parameters that are impossible, such as a negative load, give runs with the status NOT_FINITE;
-    but the oscillator at the first finite value of each axis, which is made before anything runs,
-    has to be possible. y0: start (x1, x2) where no axis says
-    otherwise. t1: end of each run, from t = 0 (dimensionless time tau = omega t). rtol, atol:
-    tolerances of a step, atol a length (None: 1e-8 of the oscillator's own size).
+    The runs use every core (every device, if JAX has others). Nothing raises because of one run:
+    each has a status. With `store` the results are written in blocks of an eighth of the runs (64
+    at least, 131,072 at most), each when it is whole. The same call with the same store goes on
+    where one was interrupted, at the first block that is not done, and returns a finished store at
+    once.
 
-    observe: what is wanted, and the variables of the dataset, over the axes:
+    The variables of the dataset, over the axes, depend on `observe`. All datasets have `status`, a
+    `Status` code for each run. Categories, such as kind, are integers with the attributes
+    flag_values and flag_meanings; `decoded` returns the words.
 
     - `"final"`: x1_end, x2_end, mode_end(belt) (contact codes as in `Trajectory.modes`), n_events.
-    - `"attractor"`: kind (equilibrium, cycle, stuck, or undecided at t1, which is 30,000 unless
-      given), signature (the events of one loop, kind and belt), sticks(belt), period,
-      stick_duration(belt) in a loop (inf where stuck for ever), x1_min, x1_max, x2_min, x2_max on
-      the attractor, transient: the time at which it was reached, n_events: of a cycle in one loop,
-      else until it was known. What is undecided has no attractor: all of these are NaN, sticks is
-      false, signature "none", and n_events those of the run. Runs end as soon as their attractor is
-      known, see `attractor.Attractor`.
-    - an object with three methods for scalars: `init(osc, x1, x2)`, the state of a run, any tree of
-      arrays; `update(state, event)`, the state after an `observers.RunEvent` (t, x1, x2, kind,
-      belt); and `finish(state, end)`, a dictionary of results, numbers or vectors, from the state
-      and an `observers.RunEnd` (t, x1, x2, status). They are traced, so use `jax.numpy`. It may see
-      more than events: with `at`, a tuple of the moments `AtEvents()`, `AtExtrema("x1")`,
-      `AtSection(function)` and `AtTimes(times)`, it is asked there; with `rates(osc, motion)`, a
-      tree of numbers, their integrals are in event.integrals and end.integrals, see `along.Motion`;
-    - a `lanes.Observer`, the base of the first two.
+    - `"attractor"`: kind (equilibrium, cycle, stuck, or undecided at t1), signature (the events of
+      one loop, kind and belt), sticks(belt), period, stick_duration(belt) in a loop (inf where
+      stuck for ever), x1_min, x1_max, x2_min, x2_max on the attractor, transient (the time at which
+      it was reached), n_events (of a cycle in one loop, else until it was known). An undecided run
+      has no attractor: all of these are NaN, sticks is false, signature "none", and n_events those
+      of the run. Runs end as soon as their attractor is known, see `attractor.Attractor`.
+      Where the oscillators are forced: kind (periodic, "quasiperiodic or chaotic", where the
+      largest exponent is above zero by three standard errors, stuck, or undecided), periods (of the
+      forcing, in one of the motion), and the variables of `"lyapunov"`; runs go on until t1.
+    - `"lyapunov"`, where the oscillators are forced: exponent (the largest Lyapunov exponent per
+      unit of time, with saltation, averaged over three quarters of the run), exponent_error (its
+      standard error), second_exponent (-inf where the mass sticks), sticks(belt), n_events.
+    - an object with three methods for scalars: `init(osc, x1, x2)` returns the state of a run, any
+      tree of arrays; `update(state, event)` the state after an `observers.RunEvent` (t, x1, x2,
+      kind, belt); `finish(state, end)` a dictionary of results, numbers or vectors, from the state
+      and an `observers.RunEnd` (t, x1, x2, status). They are traced, so use `jax.numpy`. With the
+      attribute `at`, a tuple of the moments `AtEvents()`, `AtExtrema("x1")`, `AtSection(function)`,
+      `AtTimes(times)` and, with forcing, `AtPhase(phase)`, `update` is called at these; with a
+      method `rates(osc, motion)`, which returns a tree of numbers, their integrals are in
+      event.integrals and end.integrals, see `along.Motion`.
+    - a `lanes.Observer`, the base class of the first two.
 
-    and always status, a `Status` code a run: nothing raises because of one run. Categories, such as
-    kind, are integers with the attributes flag_values and flag_meanings; `decoded` gives the words.
+    Args:
+        make: Function of parameters that returns an `Oscillator`, such as `jb.presets.class_b`;
+            other arguments can be fixed by `functools.partial`. It is called with traced arrays.
+        axes: Values, shape [n], of arguments of `make`, and of `x1` and `x2` for starts. NaN, and
+            impossible parameters such as a negative load, give runs with the status NOT_FINITE; but
+            the oscillator at the first finite value of each axis has to be possible.
+        y0: Start (x1, x2), where it is not on an axis.
+        t1: End of each run (dimensionless time tau = omega t). The default for attractors is
+            30,000, and 2,000 where the oscillators are forced.
+        t0: Time at which each run begins, which matters where the oscillator is forced.
+        rtol: Relative tolerance of a step.
+        atol: Absolute tolerance of a step, a length; None: 1e-8 of the oscillator's own size.
+        observe: What to observe: `"final"`, `"attractor"` or an object, see above.
+        derivatives: Names of axes. Each adds `d_<variable>_d_<axis>` for every variable that is a
+            float, by forward mode; NaN where the variable is not finite.
+        store: Folder for the results, a Zarr group that `xarray.open_zarr` opens.
+        executor: A `dask.distributed.Client`, whose workers do the blocks of the store, in a folder
+            that all of them see. A worker that dies costs the block that it was doing.
+        blocks: (first, last): the blocks of the store to do, `last` not among them, for processes
+            that share one store, such as those of a job array. The process that ends last finishes
+            the store; until then runs that are not done have the status and the kind -1,
+            "not_done".
+        progress: Whether to show a bar; None: on a terminal, when it takes long.
+        audit: Share of the runs, of "final" and "attractor" only, that are done again without any
+            shortcut and compared. The attributes audited and audit_differed count them; a warning
+            says if one differed.
 
-    derivatives: names of axes. Adds `d_<variable>_d_<axis>` for every variable that is a float, by
-    forward mode; NaN where the variable is not finite. store: a folder for the results as they come
-    in, a Zarr group that `xarray.open_zarr` opens; it has blocks of an eighth of the runs (64 at
-    least, 131,072 at most), each written when it is whole; the same call with the same store goes
-    on where one was interrupted, at the first block that is not, and returns at once what is
-    finished. executor: a `dask.distributed.Client`, whose workers then do the blocks
-    of the store, in a folder that all of them see; a worker that dies costs the block that it was
-    at. blocks: (first, last), which blocks of the store to do, `last` not among them, for processes
-    that share one store, such as those of a job array; who ends last finishes the store, in which
-    until then runs that are not done have the status and the kind -1, "not_done". progress: whether
-    to show a bar; None: on a terminal, when it takes long. audit: share of the runs that are done
-    once more without any shortcut and compared, of "final" and "attractor" only; the attributes
-    audited and audit_differed say how many, and a warning says so where one differed.
+    Returns:
+        The dataset, an `xarray.Dataset`.
 
-    Uses every core (every device, if JAX has others). `ValueError` names the argument that is
-    impossible, a store of another sweep among them, and says what differs. `KeyboardInterrupt` ends
-    the sweep within a second and says what became of its runs; so does `OSError` where a store
-    cannot be written.
+    Raises:
+        ValueError: If an argument is impossible, or the store is of another sweep; the message
+            names it.
+        KeyboardInterrupt: Within a second of an interrupt; the message says what became of the
+            runs.
+        OSError: If the store cannot be written; likewise.
     """
-    with _ends_told() as known:
-        question = Question.of(make, axes, y0, t1, rtol, atol, observe, derivatives)
+    with _explained_ends() as known:
+        question = Question.of(make, axes, y0, t1, rtol, atol, observe, derivatives, t0)
         audit = float(as_array(audit, "audit"))
         require(0 <= audit <= 1, "audit", "a share from 0 to 1", audit)
         require(
-            audit == 0 or not isinstance(question.program.observer, Reduce | Along),
+            audit == 0 or not isinstance(question.program.observer, Reduce | Along | Exponents),
             "audit",
             '0 but for observe="final" and "attractor"',
             audit,
@@ -131,13 +152,13 @@ def sweep(
         results = Memory(question.table)
         known.append(results)
         _do_and_show(question, results, progress)
-        told = _audited(question, results, audit) if audit else {}
-        return results.dataset(question.attributes() | told)
+        audited = _audited(question, results, audit) if audit else {}
+        return results.dataset(question.attributes() | audited)
 
 
 @contextmanager
-def _ends_told() -> "Iterator[list[Memory | Store]]":
-    """Let an interrupt, or a disk that is full, say what becomes of the runs, whenever it comes.
+def _explained_ends() -> "Iterator[list[Memory | Store]]":
+    """Makes an interrupt, or a full disk, say what becomes of the runs, whenever it comes.
 
     Yields a list for the results, once there is a place for them.
     """
@@ -145,17 +166,17 @@ def _ends_told() -> "Iterator[list[Memory | Store]]":
     try:
         yield known
     except KeyboardInterrupt:
-        told = (
+        message = (
             known[0].interrupted()
             if known
             else "interrupted before the first run; nothing is lost, the same call begins again"
         )
-        raise KeyboardInterrupt(told) from None
-    except OSError as error:  # of a store on a full disk, say
+        raise KeyboardInterrupt(message) from None
+    except OSError as error:  # of a store on a full disk, for example
         if not known:
             raise
-        told = f"{error.strerror or error}; {known[0].interrupted()}"
-        raise OSError(error.errno, told) from error
+        message = f"{error.strerror or error}; {known[0].interrupted()}"
+        raise OSError(error.errno, message) from error
 
 
 def _kept(
@@ -167,7 +188,7 @@ def _kept(
     audit: float,
     known: list[Memory | Store],
 ) -> "xarray.Dataset":
-    """The sweep in a store, or as far as that part of its blocks goes."""
+    """Does the sweep in a store, or that part of its blocks."""
     with Store.opened(path, question, part) as results:
         known.append(results)
         if results.to_do:
@@ -175,7 +196,7 @@ def _kept(
         if part is None:
             results.finish()
         if audit and results.root.attrs.get("audited", 0) < len(chosen(question.grid.runs, audit)):
-            results.tell(_audited(question, results, audit))
+            results.add_attributes(_audited(question, results, audit))
     if part is not None:
         results = Store.finish_if_done(path, question)
     return results.dataset()
@@ -184,7 +205,7 @@ def _kept(
 def _do_and_show(
     question: Question, results: Memory | Store, progress: bool | None, executor: Any = None
 ) -> None:
-    """Do the runs that the results lack, here or on a cluster."""
+    """Does the runs that the results lack, here or on a cluster."""
     with SweepProgress(results.runs, results.done(), progress) as bar:
         if executor is not None and isinstance(results, Store):
             do_on_cluster(executor, question, results, bar.advance)
@@ -193,7 +214,7 @@ def _do_and_show(
 
 
 def _check_where(question: Question, store, executor, blocks, audit: float) -> None:
-    """Raise unless blocks can be done there."""
+    """Raises unless blocks can be done there."""
     for name, value in (("executor", executor), ("blocks", blocks)):
         wanted = f"given, where {name} is: blocks are written there one by one"
         require(value is None or store is not None, "store", wanted, "None")
@@ -209,7 +230,7 @@ def _check_where(question: Question, store, executor, blocks, audit: float) -> N
 
 
 def _audited(question: Question, results: Memory | Store, share: float) -> dict[str, int]:
-    """The attributes that tell of an audit; warns of what differed."""
+    """Attributes of an audit; warns if runs differ."""
     grid = question.grid
     runs = chosen(grid.runs, share)
     known = results.of_runs(runs)
@@ -234,11 +255,15 @@ def _audited(question: Question, results: Memory | Store, share: float) -> dict[
 
 @dataclasses.dataclass(frozen=True)
 class Explanation:
-    """What `explain` returns.
+    """Size and time of a sweep; what `explain` returns.
 
-    runs: how many there are; blocks: chunks of every variable in a store; bytes: of the dataset in
-    memory, which a store compresses; compile_seconds: taken by the compilation, which the sweep
-    itself then need not do again in this process; seconds: the estimate for the runs.
+    Attributes:
+        runs: Number of runs.
+        blocks: Number of chunks of every variable in a store.
+        bytes: Size of the dataset in memory; a store compresses it.
+        compile_seconds: Time that the compilation took; the sweep itself need not compile again in
+            this process.
+        seconds: Estimated time of the runs.
     """
 
     runs: int
@@ -248,12 +273,18 @@ class Explanation:
     seconds: float
 
     def table(self) -> "pandas.DataFrame":
-        """One row: runs, blocks, bytes, compile_seconds, seconds."""
+        """Returns one row; columns: runs, blocks, bytes, compile_seconds, seconds."""
         return table_of([dataclasses.asdict(self)])
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw how long compilation and runs take, as a bar, into the axes `ax` (None: new ones),
-        which are returned."""
+        """Draws how long compilation and runs take, as bars.
+
+        Args:
+            ax: Axes; None makes new ones.
+
+        Returns:
+            The axes.
+        """
         return draw(self, ax)
 
     def __repr__(self) -> str:
@@ -276,11 +307,26 @@ def explain(
     observe: Any = "final",
     derivatives: Sequence[str] = (),
 ) -> Explanation:
-    """How much a sweep is, and how long it will take: compiles it and does a sample of its runs.
+    """Estimates the size of a sweep and its time: compiles it and does a sample of its runs.
 
-    The arguments are those of `sweep`; nothing is written. The sample is spread over the grid, as
-    many runs as a thread is given at once or fewer. `ValueError` names the argument that is
-    impossible.
+    The sample is spread over the grid, as many runs as a thread gets at once or fewer. Nothing is
+    written.
+
+    Args:
+        make: As for `sweep`, like all other arguments.
+        axes: As for `sweep`.
+        y0: As for `sweep`.
+        t1: As for `sweep`.
+        rtol: As for `sweep`.
+        atol: As for `sweep`.
+        observe: As for `sweep`.
+        derivatives: As for `sweep`.
+
+    Returns:
+        The `Explanation`.
+
+    Raises:
+        ValueError: If an argument is impossible; the message names it.
     """
     question = Question.of(make, axes, y0, t1, rtol, atol, observe, derivatives)
     grid, table = question.grid, question.table

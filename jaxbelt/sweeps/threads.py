@@ -28,15 +28,15 @@ from .queue import ROUNDS_PER_PASS, Call, Common, advance, differentiable, idle
 #: Steps that a run may take for each 100 units of time before it is given up. On its way to a
 #: pseudo-focus beside a slow belt it may pass ten thousand events in that time.
 STEP_BUDGET = 400_000
-#: Runs that the kernel is given at once: enough that a call costs nothing beside them, and few
-#: enough that the threads end together.
+#: Runs that the kernel gets at once: enough that a call costs nothing beside them, and few enough
+#: that the threads end together.
 CHUNK = SideBySide(on_cpu=2**14, elsewhere=2**20)
-#: Lanes, so many that a refill is cheap for each.
+#: Number of lanes, large enough that a refill is cheap for each.
 WIDTH = SideBySide(on_cpu=128, elsewhere=2**20)
 #: Few runs have fewer lanes, by powers of `COARSER`, so that few programs are compiled.
 LEAST_WIDTH = SideBySide(on_cpu=128, elsewhere=2**10)
 COARSER = 32
-#: Seconds in which an interrupt is to be heard; a call of the kernel takes half of that or less.
+#: Seconds within which an interrupt takes effect; a call of the kernel takes half of that or less.
 PATIENCE = 0.5
 #: Passes of the first call, before it is known how long one takes: about a seventh of a second on
 #: the CPU; with derivatives, or where there are more lanes, a pass takes longer.
@@ -45,20 +45,22 @@ FIRST_PASSES = SideBySide(on_cpu=2000, elsewhere=100)
 
 @functools.lru_cache(maxsize=32)
 def compiled(program: Program) -> Callable:
-    """The kernel of a program, one for all threads and all sweeps, compiled when first called with
-    so many derivatives."""
+    """The kernel of a program, one for all threads and all sweeps.
+
+    It is compiled at the first call with each number of derivatives.
+    """
     return wide(functools.partial(advance, program))
 
 
 def workers() -> int:
-    """Threads that run the kernel: one a core on the CPU, one a device elsewhere."""
+    """Number of threads that run the kernel: one for each core, or device other than a CPU."""
     if not is_cpu():
         return jax.local_device_count()
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def lanes_for(runs: int) -> int:
-    """Lanes for a thread that has so many runs to do."""
+    """Number of lanes for a thread with so many runs to do."""
     width = WIDTH.here
     while width // COARSER >= max(runs, LEAST_WIDTH.here):
         width //= COARSER
@@ -75,29 +77,43 @@ def run(
     t1: float,
     rtol: float,
     atol: float | None,
+    t0: float | None = None,
     derivatives: int = 0,
     budget: float = 1.0,
     threads: int | None = None,
     watch: Callable[[], None] = lambda: None,
 ) -> None:
-    """Do all runs, on so many threads or, with None, on all cores.
+    """Does all runs, on `threads` threads or, with None, on all cores.
 
-    rows_of(first, last) gives the queue, [1 + derivatives, columns, runs]: the starts and the
-    parameters that vary, and their derivatives in so many directions. Starts and atol are in the
-    units in which the oscillators were given; atol None: the default, in own units. put(numbers,
-    results) takes results [1 + derivatives, columns, runs] in any order, on any thread. budget: the
-    share of `STEP_BUDGET` that a run may take.
+    Every thread feeds chunks to one compiled kernel (which releases Python's lock) on its own
+    lanes. Long runs stay in their lanes while the next chunk is worked on. An exception, also a
+    `KeyboardInterrupt`, or one that `watch` raises, ends all threads within `PATIENCE` and is
+    raised.
 
-    Every thread feeds chunks to one compiled kernel (which lets go of Python's lock) on its own
-    lanes. Long runs stay in their lanes while the next chunk is worked on. An exception, a
-    `KeyboardInterrupt` too, or what `watch` raises, which is called every tenth of a second, ends
-    all threads within `PATIENCE` and is raised.
+    Args:
+        program: Program of the kernel.
+        shared: Leaves of the oscillator that do not vary.
+        rows_of: rows_of(first, last) returns the queue, [1 + derivatives, columns, runs]: the
+            starts and the varying parameters, and their derivatives. Starts are in the units in
+            which the oscillators were given.
+        runs: Number of runs.
+        put: put(numbers, results) takes results [1 + derivatives, columns, runs] in any order, on
+            any thread.
+        t1: End of the runs.
+        t0: Time at which they begin, see `queue.Common`.
+        rtol: Relative tolerance of a step.
+        atol: Absolute tolerance of a step, in the given units; None: the default, in own units.
+        derivatives: Number of directions of derivatives.
+        budget: Share of `STEP_BUDGET` that a run may take.
+        threads: Number of threads.
+        watch: Called every tenth of a second.
     """
     if not runs:
         return
     largest = np.iinfo(np.int32).max
     require(runs <= largest, "axes", f"{largest} runs or fewer in one call", runs)
-    limit = int(budget * STEP_BUDGET * max(1.0, t1 / 100)) // (STEPS_PER_ROUND * ROUNDS_PER_PASS)
+    span = t1 - (t0 or 0.0)
+    limit = int(budget * STEP_BUDGET * max(1.0, span / 100)) // (STEPS_PER_ROUND * ROUNDS_PER_PASS)
     limit = min(limit, largest)
     threads = workers() if threads is None else threads
     columns = 2 + sum(program.mapped)
@@ -105,7 +121,7 @@ def run(
     width = lanes_for(-(-runs // threads))
     most = CHUNK.here * width // WIDTH.here
     team = _Team(
-        functools.partial(compiled(program), Common(shared, t1, rtol, atol, np.int32(limit))),
+        functools.partial(compiled(program), Common(shared, t1, rtol, atol, np.int32(limit), t0)),
         functools.partial(_first_streams, program, shared, width, columns, derivatives),
         rows_of,
         put,
@@ -114,8 +130,8 @@ def run(
         FIRST_PASSES.here // (1 + derivatives),
     )
     devices = jax.local_devices()
-    # Compiled once, before the threads that would each do it again, and like all else not on the
-    # thread of the caller, so that an interrupt need not wait for it.
+    # Compiled once, before the threads would each do it; not on the thread of the caller, so that
+    # an interrupt need not wait for it.
     _wait([_started(team.compile, devices[0])], watch)
     at_work = [_started(team.work, devices[i % len(devices)]) for i in range(threads)]
     try:
@@ -126,7 +142,7 @@ def run(
 
 
 def _first_streams(program: Program, shared, width: int, columns: int, derivatives: int) -> Any:
-    """The stream that a kernel starts from, and its derivatives, all zero."""
+    """The empty stream that a kernel starts from, and its derivatives, all zero."""
     stream = idle(program, shared, width, columns)
     return stream, [jax.tree.map(jnp.zeros_like, differentiable(stream))] * derivatives
 
@@ -134,7 +150,7 @@ def _first_streams(program: Program, shared, width: int, columns: int, derivativ
 class _Chunks:
     """The runs in chunks, (first, last) each, for several threads to take.
 
-    Short work is shared out evenly.
+    Few runs are shared out evenly.
     """
 
     def __init__(self, runs: int, threads: int, most: int):
@@ -149,8 +165,10 @@ class _Chunks:
 
 @dataclass
 class _Team:
-    """What the threads of one call of `run` share: see there; room: the shape of a queue, with a
-    chunk and as many runs more as there are lanes."""
+    """What the threads of one call of `run` share, see there.
+
+    room: shape of a queue, with a chunk and one more run for each lane.
+    """
 
     kernel: Callable
     idle: Callable[[], Any]
@@ -162,7 +180,7 @@ class _Team:
     stop: threading.Event = field(default_factory=threading.Event)
 
     def compile(self, device) -> None:
-        """Compile the kernel by a call with nothing to do, on a device as `work` calls it."""
+        """Compiles the kernel by a call with nothing to do, on a device as `work` calls it."""
         zero = np.int32(0)
         with _settings(device):
             call = Call(zero, zero, zero, zero, np.bool_(False))
@@ -170,7 +188,7 @@ class _Team:
             jax.block_until_ready(self.kernel(queue, call, self.idle()))
 
     def work(self, device) -> None:
-        """Take chunks until there are no more, or until the team is stopped."""
+        """Takes chunks until there are no more, or until the team is stopped."""
         with _settings(device):
             passes = self.first_passes
             streams, todo = self.idle(), self.chunks.take()
@@ -181,12 +199,15 @@ class _Team:
                 streams, passes = self._chunk(queue, first, last, drain, streams, passes)
 
     def _queue(self) -> np.ndarray:
-        """Room for a chunk: of one size, for one compiled kernel."""
+        """Room for a chunk, always of one size, so that one compiled kernel serves."""
         return np.zeros(self.room)
 
     def _chunk(self, queue, first: int, last: int, drain: bool, streams, passes: int):
-        """Call the kernel until a chunk is taken (with `drain`: done); calls take half of PATIENCE
-        or so. Returns the streams, and how many passes a call may make."""
+        """Calls the kernel until a chunk is taken (with `drain`: done).
+
+        A call takes about half of PATIENCE. Returns the streams, and how many passes a call may
+        make.
+        """
         # Once for all calls.
         queue, taken, more = jax.device_put(queue), np.int32(0), True
         while more and not self.stop.is_set():
@@ -206,18 +227,18 @@ class _Team:
 
 @contextmanager
 def _settings(device) -> Iterator[None]:
-    """JAX's settings on a thread: those that a caller makes by `with` are for his thread only."""
+    """JAX's settings on a thread: a caller's `with` affects the caller's thread only."""
     with jax.enable_x64(True), jax.default_device(device):
         yield
 
 
-#: Threads at work. They outlive a call only where an interrupt came while one was compiling, for
+#: Threads at work. They outlive a call only if an interrupt came while one was compiling, as
 #: nothing ends that.
 _alive: set[threading.Thread] = set()
 
 
 def _started(function: Callable, *args: Any) -> Future:
-    """A function at work on a thread of its own."""
+    """Runs a function on a new thread."""
     future: Future = Future()
     function = as_here(function)
 
@@ -237,9 +258,9 @@ def _started(function: Callable, *args: Any) -> Future:
 
 @atexit.register
 def _end_of_process() -> None:
-    """Let no thread see the end of the interpreter, where the process would be aborted.
+    """Lets no thread see the end of the interpreter, where the process would be aborted.
 
-    A process that an interrupt ends is ended at once, as Python does it itself, by the signal.
+    A process that an interrupt ends is ended at once by the signal, as Python does it.
     """
     if _alive and getattr(sys, "last_type", None) is KeyboardInterrupt:
         sys.stdout.flush()
@@ -250,8 +271,8 @@ def _end_of_process() -> None:
 
 
 def _wait(futures: list[Future], watch: Callable[[], None]) -> None:
-    """Wait until all are done or one has failed, and raise what it raised."""
-    # With a timeout, for some systems do not interrupt a wait without one.
+    """Waits until all are done or one has failed, and raises what it raised."""
+    # With a timeout, as some systems do not interrupt a wait without one.
     while wait(futures, timeout=0.1, return_when=FIRST_EXCEPTION).not_done:
         watch()
         for future in futures:

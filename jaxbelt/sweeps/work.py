@@ -1,4 +1,4 @@
-"""The work of a sweep: runs through the kernel, of blocks into memory or a store, or any."""
+"""The work of a sweep: runs through the kernel, by blocks into memory or a store, or one by one."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -14,25 +14,25 @@ from .queue import by_name, column_of, layout
 from .store import Store
 from .threads import run
 
-#: Takes how many more runs ended with each status.
-Tell = Callable[[Mapping[int, int]], None]
+#: Function that is called with the numbers of further runs by status.
+Advance = Callable[[Mapping[int, int]], None]
 
 
 def do_runs(
     question: Question,
     results: Memory | Store,
     to_do: Sequence[int],
-    tell: Tell,
+    advance: Advance,
     **options: Any,
 ) -> None:
-    """Do the runs of some blocks; options: `threads` and `watch` of `threads.run`."""
+    """Does the runs of some blocks; options: `threads` and `watch` of `threads.run`."""
     blocks = results.blocks
     ends = np.cumsum([blocks.size(block) for block in to_do])
     starts = np.append(0, ends[:-1])
     status = column_of(question.table.layout, "status")
 
     def parts(numbers: np.ndarray):
-        """Block by block: which of the numbers are in it, and their positions there."""
+        """Yields for each block which of the numbers are in it, and their positions there."""
         if len(to_do) == 1:
             yield to_do[0], slice(None), numbers
             return
@@ -49,7 +49,7 @@ def do_runs(
     def put(numbers: np.ndarray, columns: np.ndarray) -> None:
         for block, here, positions in parts(numbers):
             results.put(block, positions, columns[:, :, here])
-        tell(counts(columns[0, status]))
+        advance(counts(columns[0, status]))
 
     run(
         question.program,
@@ -72,8 +72,9 @@ def results_of(
     t1: float,
     rtol: float,
     atol: float | None,
+    t0: float | None = None,
 ) -> dict[str, np.ndarray]:
-    """The results of runs by name, [runs, ...], in the order of the runs; arguments: of
+    """Results of runs by name, [runs, ...], in the order of the runs; arguments as for
     `threads.run`."""
     shapes = layout(program, shared)
     columns = np.zeros((sum(math.prod(shape) for shape in shapes.values()), runs))
@@ -81,11 +82,11 @@ def results_of(
     def put(places: np.ndarray, results: np.ndarray) -> None:
         columns[:, places] = results[0]
 
-    run(program, shared, rows_of, runs, put, t1=t1, rtol=rtol, atol=atol)
+    run(program, shared, rows_of, runs, put, t1=t1, rtol=rtol, atol=atol, t0=t0)
     return by_name(shapes, columns)
 
 
 def counts(statuses: np.ndarray) -> dict[int, int]:
-    """How many runs ended with each status."""
+    """Numbers of runs by status."""
     numbers = np.bincount(statuses.ravel().astype(int))
     return {int(i): int(numbers[i]) for i in np.flatnonzero(numbers)}

@@ -38,7 +38,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxbelt as jb
-from jaxbelt.numerics import widths
+from jaxbelt.numerics import compiling, widths
 from jaxbelt.sweeps import threads
 from jaxbelt.sweeps.question import Question
 from jaxbelt.sweeps.queue import ROUNDS_PER_PASS, STEPS_PER_ROUND, Common, _work
@@ -295,7 +295,8 @@ def kernel_alone(axes, options, events: float) -> dict[str, Any]:
     rate, memory = peaks()
     bounds = {
         "float64 operations": lane_passes * operations / rate,
-        "memory": lane_passes * moved / memory,
+        # The few lanes of a CPU stay in its nearest cache.
+        "memory": 0.0 if widths.is_cpu() else lane_passes * moved / memory,
     }
     bound = max(bounds, key=lambda name: bounds[name])
     return {
@@ -356,7 +357,7 @@ def cost_of_pass(program, shared) -> tuple[float, float]:
     """
     width = 256
     stream = threads._first_streams(program, shared, width, 2 + sum(program.mapped), 0)[0]
-    common = Common(shared, 100.0, 1e-8, np.nan, np.int32(1))
+    common = Common(shared, *map(jnp.asarray, (100.0, 1e-8, np.nan, np.int32(1))))
     traced = jax.make_jaxpr(lambda stream: _work(program, common, stream, [])[0])(stream)
     state = sum(leaf.nbytes for leaf in jax.tree.leaves(stream.lanes)) / width
     return operations(traced.jaxpr) / width, 2 * state * ROUNDS_PER_PASS * STEPS_PER_ROUND
@@ -381,14 +382,16 @@ def peaks() -> tuple[float, float]:
     """float64 operations and bytes a second of all devices, by two small programs: multiplications
     and additions of numbers that stay in registers, and a copy of a large array."""
     small = jax.devices()[0].platform == "cpu"
-    chain, rounds, size = 256, 8, 2**16 if small else 2**21
+    # Several chains beside each other: of one alone each operation waits for the one before.
+    chains, length, rounds, size = 8, 32, 8, 2**16 if small else 2**21
 
-    @jax.jit
+    @functools.partial(jax.jit, compiler_options=compiling.known(compiling.WIDE))
     def multiply(x, a, b):
         def again(_, x):
-            for _ in range(chain):
-                x = x * a + b
-            return x
+            several = [x * (1.0 + i) for i in range(chains)]
+            for _ in range(length):
+                several = [one * a + b for one in several]
+            return functools.reduce(jnp.add, several)
 
         return jax.lax.fori_loop(0, rounds, again, x)
 
@@ -407,7 +410,7 @@ def peaks() -> tuple[float, float]:
 
     x, large = jnp.linspace(0.0, 1.0, size), jnp.zeros(2**22 if small else 2**27)
     devices = jax.local_device_count()
-    rate = 2 * chain * rounds * size / fastest(lambda: multiply(x, 0.5, 0.1))
+    rate = 2 * chains * (length + 1) * rounds * size / fastest(lambda: multiply(x, 0.5, 0.1))
     return devices * rate, devices * 2 * large.nbytes / fastest(lambda: copy(large, 1.0))
 
 

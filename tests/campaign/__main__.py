@@ -18,7 +18,7 @@ import time
 import traceback
 from pathlib import Path
 
-from .cases import STRUCTURES
+from .cases import REGIMES, STRUCTURES
 from .outcome import Outcome, summed
 
 #: Of which module each campaign is.
@@ -26,24 +26,37 @@ CAMPAIGNS = {
     **dict.fromkeys(("final", "simulate", "derivatives", "attractors", "grazing"), "runs"),
     **{
         name: name
-        for name in ("paths", "refine", "portraits", "shocks", "fractions", "maps", "steep")
+        for name in (
+            *("paths", "refine", "portraits", "shocks", "fractions", "maps", "steep"),
+            *("coverage", "slopes"),
+        )
     },
+    "forced-sweep": "forced_sweeps",
+    "forced": "forced_runs",
 }
 #: What can be asked of each campaign beside `--results`.
 PLAIN = frozenset({"seed", "runs"})
-RUNS = PLAIN | {"threads", "extreme_share", "heavy", "structure", "tol", "table"}
+RUNS = PLAIN | {"threads", "extreme_share", "heavy", "regime", "structure", "tol", "table"}
 KNOWN = {
     **dict.fromkeys(("paths", "refine", "portraits", "shocks"), PLAIN),
     "maps": frozenset(),
-    "steep": PLAIN,
+    **dict.fromkeys(("steep", "coverage", "slopes"), PLAIN),
     "fractions": PLAIN | {"threads"},
+    "forced-sweep": PLAIN | {"threads", "structure", "tol"},
+    "forced": PLAIN | {"threads", "structure", "tol"},
     **dict.fromkeys(("final", "simulate", "attractors"), RUNS),
     "derivatives": RUNS | {"by"},
-    "grazing": RUNS - {"extreme_share", "heavy"} | {"by"},
+    "grazing": RUNS - {"extreme_share", "heavy", "regime"} | {"by"},
 }
 #: What is not told.
 DEFAULTS = dict(
-    seed=0, runs=2000, extreme_share=0.0, heavy=False, by="simulate", threads=os.cpu_count()
+    seed=0,
+    runs=2000,
+    extreme_share=0.0,
+    heavy=False,
+    regime=None,
+    by="simulate",
+    threads=os.cpu_count(),
 )
 #: Seconds between two lines where everything agrees.
 QUIET = 15.0
@@ -184,15 +197,13 @@ def _parsed(arguments):
     told = {name for name, value in vars(options).items() if value is not None}
     for name in sorted(told - {"what", "results"} - KNOWN[what]):
         parser.error(f"--{name.replace('_', '-')}: {what} does not know it")
-    if options.by == "find_cycle" and what == "derivatives":
-        parser.error("--by: derivatives are asked of simulate or sweep")
-    if options.by == "find_cycle" and options.structure is not None:
+    if what == "grazing" and options.by == "find_cycle" and options.structure is not None:
         parser.error("--structure: cycles that graze have none")
     for name, value in DEFAULTS.items():
         if name not in told:
             setattr(options, name, value)
     if options.tol is None:
-        options.tol = 1e-10 if what in ("simulate", "derivatives", "grazing") else 1e-8
+        options.tol = 1e-10 if what in ("simulate", "forced", "derivatives", "grazing") else 1e-8
     return options
 
 
@@ -243,6 +254,12 @@ def _parser():
         action="store_const",
         const=True,
         help="loads of 1e-6 to 1e6 beside one another, half of the cases on round numbers",
+    )
+    parser.add_argument(
+        "--regime",
+        choices=REGIMES,
+        help="four and six belts; laws with a jump; a Stribeck speed of 1e-4 of the belt; friction "
+        "that grows beyond the static limit",
     )
     parser.add_argument(
         "--by",

@@ -338,6 +338,44 @@ def heavy_case(rng, structure, T=50.0):
     )
 
 
+# ---------------------------------------------------------------- regimes
+
+#: What is asked of a regime: its structures.
+REGIMES = {
+    # Four and six belts.
+    "many": [(("conti",) * 4, True), (("conti", "coulomb") * 2, False), (("conti",) * 6, True)],
+    # The static limit is far from what the belt rubs with.
+    "jumps": [(("coulomb", "coulomb"), True), (("table",), False), (("table", "conti"), True)],
+    # Stribeck's speed is 1e-4 of that of the belt.
+    "thin": [(("stribeck",), False), (("stribeck", "conti"), True), (("stribeck",) * 2, False)],
+    # Friction that grows with the speed beyond the static limit.
+    "rising": [(("peak",), False), (("peak", "peak"), True), (("peak", "conti"), True)],
+}
+
+
+def regime_case(rng, structure, regime, T=50.0):
+    """A random or a rational case of a regime."""
+    laws, edges = structure
+    known = tuple("conti" if law in ("table", "peak") else law for law in laws)
+    is_round = rng.random() < 0.5
+    case = (rational_case if is_round else random_case)(rng, (known, edges), T)
+    belts = []
+    for law, belt in zip(laws, case.oscillator.belts):
+        static, number = belt.law[1], float(rng.uniform(0.1, 0.9))
+        number = round(number, 1) if is_round else number
+        if regime == "thin" and law == "stribeck" and belt.velocity:
+            belt = replace(belt, law=(*belt.law[:3], 1e-4 * abs(belt.velocity)))
+        elif law == "coulomb" and regime == "jumps":
+            belt = replace(belt, law=(law, static, number * static))
+        elif law == "table":
+            belt = replace(belt, law=(law, 1.0 + number, 10 * number))
+        elif law == "peak":
+            belt = replace(belt, law=(law, static, static * (1 + number), number, 0.5 * number))
+        belts.append(belt)
+    osc = replace(case.oscillator, belts=tuple(belts))
+    return replace(case, oscillator=osc, kind=f"{regime}, {case.kind}")
+
+
 # ---------------------------------------------------------------- grazing
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 import jaxbelt as jb
 from jaxbelt.bifurcations.bounds import Bounds, neighbours_that_differ
-from jaxbelt.bifurcations.cells import look_at
+from jaxbelt.bifurcations.cells import motions_in_cells
 from jaxbelt.bifurcations.regions import varied_by_names
 from jaxbelt.model.own_units import in_own_units
 from jaxbelt.numerics.continuation import Stop
@@ -102,7 +102,7 @@ def _boundaries(plane: Plane, told: jb.RegionMap) -> np.ndarray:
     """Pairs of neighbouring cells that differ, as `bounds.neighbours_that_differ` has them."""
     grid = np.meshgrid(*told.values, indexing="ij")
     points = np.column_stack([axis.ravel() for axis in grid])
-    cells = look_at(_own(plane), told.names, points)
+    cells = motions_in_cells(_own(plane), told.names, points)
     return neighbours_that_differ(cells.motions.reshape(grid[0].shape), told.on_line)
 
 
@@ -122,7 +122,7 @@ def _bounds_something(plane: Plane, told: jb.RegionMap, curve: jb.BifurcationCur
         chord = (curve.values[min(row + 1, len(curve) - 1)] - curve.values[max(row - 1, 0)]) / sides
         normal = np.array([-chord[1], chord[0]]) / np.linalg.norm(chord)
         points += [curve.values[row] + side * BESIDE * normal * sides for side in (-1, 1)]
-    motions = look_at(_own(plane), told.names, np.array(points)).motions
+    motions = motions_in_cells(_own(plane), told.names, np.array(points)).motions
     return bool(
         np.any((motions[::2] != motions[1::2]) & (motions[::2] >= 0) & (motions[1::2] >= 0))
     )

@@ -470,7 +470,7 @@ class OwnPath:
         )
 
     def look(self, values) -> None:
-        self.path.look([self._own(value) for value in values])
+        self.path.find_labels([self._own(value) for value in values])
 
     def label(self, value: float):
         return self.path.label(self._own(value))
@@ -508,7 +508,7 @@ def check(case: Case, seed: int) -> Report:
     brute = Brute(case, rng)
     for value in values:
         brute.look(value)
-    path.look(values)
+    path.find_labels(values)
     for value in values:
         _compare(path, brute, value, report)
     brute.spread()
@@ -518,7 +518,7 @@ def check(case: Case, seed: int) -> Report:
             if not any(low - tolerance <= at <= high + tolerance for at in special):
                 # The basin of a cycle about to vanish may be missed: with a start on that of
                 # `scan` the engine says whether it is there.
-                path.look([low, high])
+                path.find_labels([low, high])
                 for value in (low, high):
                     for start in _starts_on_cycles(path, value):
                         brute.learn(value, start)
@@ -572,7 +572,7 @@ def _both_sides(path: OwnPath, point, special, brute: Brute, report: Report) -> 
         if not _part(brute.case, path.orbit(point), float(point.place[4]), at, away):
             report.wrong.append(f"no orbits part at {point!r}")
         return
-    path.look([at - away, at + away])
+    path.find_labels([at - away, at + away])
     sides = [brute.look(side, _starts_on_cycles(path, side)) for side in (at - away, at + away)]
     for label, other, value in ((*sides, at + away), (*sides[::-1], at - away)):
         for cycle in label.cycles:

@@ -20,7 +20,7 @@ BATCH = 512
 def settings(options):
     names = ["runs", "by", "structure", "tol", "extreme_share"]
     # Files of results that were written before there were any have no such setting.
-    names += ["heavy"] if options.heavy else []
+    names += [name for name in ("heavy", "regime") if getattr(options, name)]
     return {name: getattr(options, name) for name in names}
 
 
@@ -92,6 +92,7 @@ def _batches(options):
     if options.what == "grazing" and options.by == "find_cycle":
         return [(None, min(BATCH, options.runs - n)) for n in range(0, options.runs, BATCH)]
     structures = cases.structures(np.random.default_rng(options.seed), cases.STRUCTURES)
+    structures = cases.REGIMES.get(options.regime, structures)
     # Half of them in the commonest structure of two belts with edges; of grazing all alike.
     shares = np.array([2.0 / (1 + i) for i in range(len(structures))])
     if options.what == "grazing":
@@ -115,6 +116,8 @@ def _case(rng, structure, options):
         return cases.grazing_case(rng, structure, smallest)
     if options.heavy:
         return cases.heavy_case(rng, structure)
+    if options.regime:
+        return cases.regime_case(rng, structure, options.regime)
     chance = rng.random()
     if chance < 0.5:
         return cases.rational_case(rng, structure)
@@ -175,6 +178,8 @@ def _plain(value):
 def _has_derivatives(mine, run, options):
     """Whether derivatives are asked of a run, `mine` the engine's: near grazing always, else where
     it goes on until T, or to a pseudo-focus, and comes near to no other outcome, or to a corner."""
+    if options.what == "derivatives" and options.by == "find_cycle":
+        return mine.kind == "cycle" and mine.margin > 1e-6
     if options.what == "derivatives":
         clear = mine.margin > 1e-6 or mine.margin <= compare.CORNER
         lasts = mine.t_end == cases.Case.T and mine.status == engine.OK

@@ -1,6 +1,6 @@
 """How long a call may leave somebody at a terminal, or at a notebook, without a sign of life.
 
-`python -m tests.silence` calls what may take long, each function in a process of its own, in which
+`python -m tools.silence` calls what may take long, each function in a process of its own, in which
 nothing was compiled before, and then once more; names choose among them, and `--notebook` asks a
 kernel of Jupyter (the group `notebooks`) in place of a pseudo-terminal. What changes on the screen
 is stamped with the time at which it comes. Told are the seconds that a call takes, and the longest

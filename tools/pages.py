@@ -1,4 +1,4 @@
-"""Checks the built documentation: `python -m tests.pages SITE`.
+"""Checks the built documentation: `python -m tools.pages SITE`.
 
 Every public name has a page with its signature and an example; enumerations list their members;
 notebooks and theory have their pictures; no link is dead; nothing comes from the network. All of it

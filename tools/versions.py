@@ -1,6 +1,6 @@
 """Builds the package and tests the wheel: on every Python, and with the oldest dependencies.
 
-`python -m tests.versions`, with `uv` installed (the group `release`), before a release. The wheel
+`python -m tools.versions`, with `uv` installed (the group `release`), before a release. The wheel
 is built from the source distribution, and the tests are those of the latter, without the package's
 source beside them: what they import is what was installed. Names of environments as arguments
 choose among them. A part of the tests is run, of what depends on other packages most; with

@@ -1,0 +1,541 @@
+"""Lanes whose oscillators know the time: their starts, steps and events.
+
+Beside `step`, `events` and `rounds`, which are for oscillators without a clock, for three reasons.
+Where x2' = 0 the next derivative is not -x2, boundaries may move, and stick phases are not over in
+closed form. So a step asks each guard of its mode by its control points, see `control_points`,
+whether it may vanish; and a mass that sticks is stepped as well, its stages on the belt's course,
+where their x2' is the force that the belts have to hold. A step has the derivatives of the motion
+at a fixed time; those of events are not in it.
+
+The guards are numbered as in `instants.guards_at`. Of boundaries and edges the values and slopes at
+both ends of a step and the integral are known, as in `step`: these make a polynomial. What stuck
+belts have to hold is known at the times of the stages to the last bits, and so is a polynomial of
+degree eight. What follows at a guard is decided by `instants`, a lane at a time.
+"""
+
+import functools
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from ..model.instants import (
+    begun_at,
+    blur,
+    is_held_for_ever,
+    on_guard_at,
+    passed_guard,
+)
+from ..model.modes import (
+    Mode,
+    any_of,
+    bounds_leftward,
+    bounds_rightward,
+    edges,
+    first_of,
+    foremost,
+    has_edges,
+    mode_acceleration,
+    select,
+    without_rounding,
+)
+from ..model.oscillator import Oscillator, at_time, fastest, has_possible_numbers
+from ..numerics.compiling import where_any
+from ..numerics.control_points import (
+    from_monomials,
+    highest_difference,
+    passage,
+    through,
+    value_at,
+)
+from ..results import Status
+from .lanes import Lanes, Passage, choose, materialise
+from .step import (
+    LANDING,
+    LANDS_WITHIN,
+    LONGEST_STEP,
+    NEVER,
+    NO_STEP,
+    SLOW,
+    STEP_SAFETY,
+    as_quotient,
+    combine,
+    first_step,
+    next_size,
+    nystroem,
+)
+from .waves import StepClock, StepWave
+
+#: Longest step of a mass that sticks, times the highest frequency: the polynomial of what is needed
+#: is then good to 1e-9, and steps that end at its root are made again.
+LONGEST_STUCK = 1.2
+#: Rounding of guards, over their size: of boundaries and edges, and of what is needed.
+ROUNDING, NEEDED_ROUNDING = 1e-15, 1e-13
+#: Steps shorter than this have their polynomials from values and slopes alone: what the integral
+#: adds is rounding.
+SHORT = 1e-3
+#: No step is asked twice below this one, over the time that a Taylor step bridges.
+SHORTEST = 1e-4
+#: Of the highest coefficient of what is needed, how far the polynomial may be off.
+LAST_TERM = 1e-4
+#: Error of the time of slip onset that needs no shorter step, over `LANDS_WITHIN` of the tolerance.
+STRAIGHT = 1.0
+#: The stages, by their number, whose times make the polynomial of what is needed, beside the
+#: start, 0: of all of them the rounding would be a thousand times as large.
+STAGES = (2, 6, 4, 7, 8, 9, 10, 13)
+
+
+def _of_lanes(function: Callable, osc: Oscillator, *args: Any) -> Any:
+    """What a function of an oscillator and more gives, lane by lane."""
+    axes = jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, osc)
+    return jax.vmap(function, in_axes=(axes, *(0 for _ in args)))(osc, *args)
+
+
+def needed_or_rate(osc: Oscillator, mode: Mode, t: Array, x1: Array, x2: Array) -> Array:
+    """x2' of lanes that slip; of lanes that stick, what is needed."""
+    return mode_acceleration(at_time(osc, t), mode, x1, x2)
+
+
+def lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, t0=0.0) -> Lanes:
+    """Lanes at the start of their runs, at the time t0, without what an observer adds."""
+    zero = jnp.zeros_like(x1)
+    t = zero + t0
+
+    def start(osc, x1, x2, t):
+        y = x1, x2, t
+        mode, focus = begun_at(osc, y)
+        mode = Mode(tuple(code + jnp.zeros(()) for code in mode.codes))
+        return mode, focus & jnp.asarray(True), is_held_for_ever(osc, mode, y)
+
+    mode, rests, forever = _of_lanes(start, osc, x1, x2, t)
+    finite = jnp.isfinite(x1) & jnp.isfinite(x2) & has_possible_numbers(osc)
+    status = jnp.where(forever, Status.STUCK_FOREVER.value, Status.OK.value)
+    status = jnp.where(rests, Status.PSEUDO_FOCUS.value, status)
+    status = jnp.where(finite, status, Status.NOT_FINITE.value)
+    count = jnp.zeros_like(run)
+    return Lanes(
+        run=run,
+        first_pass=jnp.full_like(run, passes),
+        t=t,
+        x1=x1,
+        x2=x2,
+        a=needed_or_rate(osc, mode, t, x1, x2) + zero,
+        h=zero + first_step(rtol),
+        pace=zero + STEP_SAFETY / first_step(rtol),
+        mode=mode,
+        events=count,
+        status=status.astype(run.dtype),
+        done=~finite | rests,
+        lower=x2,
+        upper=x2,
+        memory=None,
+        hit=count - 1,
+    )
+
+
+class Window(eqx.Module):
+    """What does not change until the next event, arrays [lanes].
+
+    signs: of the mode; stuck, active: lanes that stick, that are to be stepped; longest: their
+    longest step; edges: (left, right), where the mode ends, and their numbers; None: no edges.
+    """
+
+    signs: tuple[Array, ...]
+    stuck: Array
+    active: Array
+    longest: Array
+    edges: tuple[Array, Array] | None
+    numbers: tuple[Array, Array] | None
+
+
+def window_of(osc: Oscillator, lanes: Lanes, *, extrema: Array | None = None) -> Window:
+    """The bounds of the current modes."""
+    mode, n = lanes.mode, len(osc.belts)
+    stuck = mode.any_stuck
+    most = jnp.where(stuck, LONGEST_STUCK, LONGEST_STEP) / fastest(osc)
+    found, numbers = None, None
+    if has_edges(osc):
+        found, numbers = [], []
+        sides = (
+            (bounds_leftward(mode), jnp.maximum, -jnp.inf),
+            (
+                bounds_rightward(mode),
+                jnp.minimum,
+                jnp.inf,
+            ),
+        )
+        for flags, pick, none in sides:
+            places = [
+                jnp.where(flag, edge, none) for flag, edge in zip(flags, edges(osc), strict=True)
+            ]
+            edge = functools.reduce(pick, places)
+            hit = [flag & (place == edge) for flag, place in zip(flags, places, strict=True)]
+            names = [jnp.asarray(n + i) for i in range(2 * n)]
+            numbers.append(first_of(hit, names, jnp.asarray(-1)))
+            found.append(foremost(at_time(osc, lanes.t), hit, edges(osc), edge))
+        found, numbers = tuple(found), tuple(numbers)
+    return Window(mode.signs, stuck, ~lanes.done, most, found, numbers)
+
+
+class _Attempt(eqx.Module):
+    """A step of size h, not yet accepted, as `step._Attempt`; rate: x2' at the end, of lanes that
+    stick the belt's; needed: what stuck belts have to hold, at the start and at `STAGES`."""
+
+    h: Array
+    x1: Array
+    x2: Array
+    a: Array
+    rate: Array
+    error: Array
+    integrals: Any
+    needed: list[Array]
+
+
+def _attempt(osc, clock: StepClock, window: Window, lanes: Lanes, rtol, atol, rates) -> _Attempt:
+    """One Runge-Kutta step of all lanes that slip; those that stick follow their belt."""
+    own, h, ones, mode, stuck = nystroem(), clock.h, clock.ones, lanes.mode, window.stuck
+    x1, x2, stages = lanes.x1, lanes.x2, [lanes.a]
+
+    def placed(c, x1_slip, x2_slip):
+        return select(stuck, clock.carried(mode, x1, c), (x1_slip, x2_slip))
+
+    def field(c, x1, x2):
+        now = clock.at(c)
+        signs = window.signs
+        pulls = tuple(belt.load * sign for belt, sign in zip(now.belts, signs, strict=True))
+        a = as_quotient(now, signs, pulls, ones, x1, x2)
+        return a - _stick_rate(now, mode) if _moves(now) else a
+
+    slopes = [rates(osc, mode, lanes.t, x1, x2)] if rates else []
+    for row, row1, c in zip(own.a[1:-1], own.aa[1:-1], own.c[1:-1].tolist(), strict=True):
+        drift = c * x2 + h * combine(row1, stages) if np.any(row1) else c * x2
+        state = placed(c, x1 + h * drift, x2 + h * combine(row, stages))
+        stages.append(field(c, *state))
+        if rates:
+            slopes.append(rates(osc, mode, lanes.t + c * h, *state))
+    y1 = x1 + h * (x2 + h * combine(own.aa[-1], stages))
+    y2 = x2 + h * combine(own.a[-1], stages)
+    y1, y2 = (materialise(y, ones) for y in placed(1.0, y1, y2))
+    stages.append(field(1.0, y1, y2))
+    scale1 = atol + rtol * jnp.maximum(jnp.abs(x1), jnp.abs(y1))
+    scale2 = atol + rtol * jnp.maximum(jnp.abs(x2), jnp.abs(y2))
+    error1, error2 = jnp.abs(h * h * combine(own.ea, stages)), jnp.abs(h * combine(own.e, stages))
+    error = jnp.maximum(error1 * scale2, error2 * scale1) / (scale1 * scale2)
+    error = jnp.where(stuck, jnp.where(jnp.isfinite(stages[-1]), 0.0, jnp.inf), error)
+    integrals = jax.tree.map(lambda i, *s: i + h * combine(own.a[-1], s), lanes.integrals, *slopes)
+    end = clock.at(1.0)
+    rate = jnp.where(stuck, _stick_rate(end, mode), stages[-1])
+    needed = [stages[i] for i in (0, *STAGES)]
+    return _Attempt(h, y1, y2, stages[-1], rate, lax.stop_gradient(error), integrals, needed)
+
+
+def flown(osc, window: Window, ones: Array, lanes: Lanes, h: Array, x1: Array, x2: Array):
+    """The states (x1, x2) that a step of size h leads to from those of the arguments."""
+    a = needed_or_rate(osc, lanes.mode, lanes.t, x1, x2)
+    lanes = replace(lanes, x1=x1, x2=x2, a=a)
+    clock = StepClock.of(osc, ones, lanes.t, h)
+    new = _attempt(osc, clock, window, lanes, jnp.ones(()), jnp.ones(()), None)
+    return new.x1, new.x2
+
+
+def _moves(now: Oscillator) -> bool:
+    return any(hasattr(belt, "rate") for belt in now.belts)
+
+
+def _stick_rate(now: Oscillator, mode: Mode) -> Array:
+    """The acceleration of the belts that are stuck to, over omega; 0 where none is."""
+    zero = jnp.zeros_like(mode.codes[0])
+    if not _moves(now):
+        return zero
+    rates = [zero + getattr(belt, "rate", 0.0) for belt in now.belts]
+    return foremost(now, mode.stuck, rates, zero) / now.omega
+
+
+class _Meeting(eqx.Module):
+    """What a step has to do with one guard.
+
+    once, cut, there: see `control_points.Passage`; delta: the time from the end of the step on to
+    where it vanishes, NEVER where no Taylor step leads there. number: of the guard.
+    """
+
+    once: Array
+    cut: Array
+    there: Array
+    delta: Array
+    number: Array
+
+
+def _meeting(points, doubt, rounding, ends, h, room, reach, number) -> _Meeting:
+    """ends: the guard's (value, slope) at the start and at the end, by the time; room: see
+    `step.LANDS_WITHIN`."""
+    (_, slope0), (value, slope) = ends
+    met = passage(points, doubt, rounding, h < SHORTEST * reach)
+    bend = (slope - slope0) / jnp.where(h > 0, h, 1.0)
+    falls = slope < 0
+    near = jnp.abs(value) * jnp.maximum(-slope, SLOW * jnp.abs(bend)) <= reach * slope * slope
+    straight = value * value * jnp.abs(bend) * h <= room * slope * slope
+    # Where it only touches, within rounding, no Taylor step leads to it.
+    depth = jnp.where(bend > 0, 0.5 * slope * slope / jnp.where(bend > 0, bend, 1.0), jnp.inf)
+    near = near & falls & straight & (value - depth < -rounding)
+    delta = -value / jnp.where(near, slope, 1.0)
+    delta = delta - 0.5 * bend * delta * delta / jnp.where(near, slope, 1.0)
+    return _Meeting(
+        met.once, met.cut, met.there, jnp.where(near, delta, NEVER), jnp.asarray(number)
+    )
+
+
+def _quartic(start, end, change, h) -> list[Array]:
+    """Coefficients of a function over a step by (value, slope) at both ends and its integral over
+    the step; `change` is None where that is not known."""
+    (f0, s0), (f1, s1) = start, end
+    m0, m1 = h * s0, h * s1
+    rise = f1 - f0
+    k4 = 30 * (change / jnp.where(h > 0, h, 1.0) - 0.5 * (f0 + f1) - (m0 - m1) / 12)
+    k4 = jnp.where(h < SHORT, 0.0, k4)
+    c2, c3 = 3 * rise - 2 * m0 - m1, m0 + m1 - 2 * rise
+    return [f0, m0, c2 + k4, c3 - 2 * k4, k4]
+
+
+def _meetings(osc, clock: StepClock, window: Window, lanes: Lanes, new: _Attempt, rtol, atol):
+    """What the step has to do with each guard of its mode."""
+    h, n, ones = clock.h, len(osc.belts), clock.ones
+    reach = LANDING * jnp.sqrt(rtol)
+    room = LANDS_WITHIN * (atol + rtol * jnp.abs(new.x2)) * h
+    start = clock.at(0.0)
+    stuck, mode = window.stuck, lanes.mode
+    rate0 = jnp.where(stuck, _stick_rate(start, mode), lanes.a)
+    own = _quartic((lanes.x2, rate0), (new.x2, new.rate), new.x1 - lanes.x1, h)
+    own = [materialise(k, ones) for k in own]
+    found, fuzz = [], ROUNDING * blur(lanes.t)
+    for i, code in enumerate(mode.codes):
+        slips = jnp.abs(code) == 1
+        v = clock.velocities[i]
+        ends = (v.at(0.0), v.rate(0.0)), (v.at(1.0), v.rate(1.0))
+        wave = [ends[0][0]]
+        if _moves(start):
+            wave = _quartic(*ends, v.integral(1.0, h), h)
+        # Not where the mode has no such guard: it stays positive there.
+        guard = [w - osc.omega * k for w, k in zip(wave, own)] + [
+            -osc.omega * k for k in own[len(wave) :]
+        ]
+        there = [jnp.where(slips, code * k, 0.0) for k in guard]
+        there[0] = jnp.where(slips, there[0], 1.0)
+        doubt = jnp.abs(there[4]) + 0.1 * jnp.abs(there[3])
+        size = 1 + jnp.abs(ends[1][0]) + jnp.abs(new.x2)
+        by_time = [
+            (code * (value - osc.omega * x2), code * (rate - osc.omega * a))
+            for (value, rate), x2, a in zip(ends, (lanes.x2, new.x2), (rate0, new.rate))
+        ]
+        by_time = [(jnp.where(slips, g, 1.0), jnp.where(slips, slope, 0.0)) for g, slope in by_time]
+        points = from_monomials(there)
+        found.append(_meeting(points, doubt, fuzz * size, by_time, h, room, reach, i))
+    if window.edges is not None and window.numbers is not None:
+        x1 = [lanes.x1, *(h * k / (j + 1) for j, k in enumerate(own))]
+        for side, (edge, number) in enumerate(zip(window.edges, window.numbers, strict=True)):
+            way, there = (1.0, -1.0)[side], jnp.isfinite(edge)
+            place = jnp.where(there, edge, 0.0)
+            guard = [jnp.where(there, way * k, 0.0) for k in (x1[0] - place, *x1[1:])]
+            guard[0] = jnp.where(there, guard[0], 1.0)
+            doubt = jnp.abs(guard[5]) + 0.1 * jnp.abs(guard[4])
+            size = 1 + jnp.abs(new.x1)
+            by_time = [
+                (jnp.where(there, way * (x - place), 1.0), jnp.where(there, way * v, 0.0))
+                for x, v in ((lanes.x1, lanes.x2), (new.x1, new.x2))
+            ]
+            points = from_monomials(guard)
+            found.append(_meeting(points, doubt, fuzz * size, by_time, h, room, reach, number))
+    none = jnp.zeros_like(h)
+    no = none > 0
+    limit = where_any(
+        stuck,
+        lambda: _limit(osc, clock, window, lanes, new, room, reach),
+        _Meeting(no, no, none + 1, none + NEVER, jnp.full_like(lanes.hit, 3 * n)),
+    )
+    asked = stuck & (lanes.status != Status.STUCK_FOREVER.value)
+    once, cut, delta = limit.once & asked, limit.cut & asked, jnp.where(asked, limit.delta, NEVER)
+    found.append(replace(limit, once=once, cut=cut, delta=delta))
+    return found
+
+
+def _limit(osc, clock: StepClock, window, lanes, new: _Attempt, room, reach) -> _Meeting:
+    """The meeting with a limit of what stuck belts can hold, capacity -+ needed: the nearer one.
+
+    Where it may meet both the step is cut.
+    """
+    own, n, h = nystroem(), len(osc.belts), clock.h
+    nodes = tuple(round(float(own.c[i]), 12) for i in (0, *STAGES))
+    matrix = through(nodes)
+    needed = [materialise(combine(row, new.needed), clock.ones) for row in matrix]
+
+    def capacity(c):
+        now = clock.at(c)
+        total = jnp.zeros_like(h)
+        for belt, stuck in zip(now.belts, lanes.mode.stuck, strict=True):
+            total = total + jnp.where(stuck, belt.load * belt.friction.static, 0.0)
+        return total
+
+    if any(isinstance(load, StepWave) for load in clock.loads):
+        capacities = [capacity(c) for c in nodes]
+        held = [combine(row, capacities) for row in matrix]
+    else:
+        held = [capacity(1.0)] * len(nodes)
+    pairs = list(zip(held, needed, strict=True))
+    least = [functools.reduce(jnp.minimum, [c + way * x for c, x in pairs]) for way in (-1.0, 1.0)]
+    way = jnp.where(least[0] < least[1], -1.0, 1.0)
+    points = [c + way * x for c, x in pairs]
+    size = 1 + jnp.abs(held[-1]) + jnp.abs(lanes.x1)
+    fuzz = NEEDED_ROUNDING * blur(lanes.t) * size
+    doubt = LAST_TERM * jnp.abs(highest_difference(points)) + fuzz
+    safe = jnp.where(h > 0, h, 1.0)
+    ends = [(p, (len(points) - 1) * (q - p) / safe) for p, q in (points[:2], points[-2:])]
+    ends[1] = (points[-1], ends[1][1])
+    number = jnp.where(way < 0, 3 * n, 3 * n + 1).astype(lanes.hit.dtype)
+    one = _meeting(points, doubt, fuzz, ends, h, room, reach, number)
+    both = (jnp.maximum(*least) <= doubt) & (h > SHORTEST * reach)
+    one = replace(one, cut=one.cut | both, there=jnp.where(both, 0.5 * one.there, one.there))
+    if any(isinstance(v, StepWave) for v in clock.velocities):
+        return one
+    # The way is straight: the state at the root is as good as that at the end.
+    _, slope, _ = value_at(points, one.there)
+    sharp = doubt * safe <= STRAIGHT * room * jnp.abs(slope)
+    back = jnp.where(one.once & ~one.cut & sharp, (one.there - 1) * h, one.delta)
+    return replace(one, delta=back)
+
+
+def take_step(
+    osc,
+    window: Window,
+    ones: Array,
+    lanes: Lanes,
+    t1,
+    rtol,
+    atol,
+    rates: Callable | None = None,
+    *,
+    derivatives: bool = False,
+) -> Lanes:
+    """One step of all lanes: kept, shortened to end on a guard, or rejected; see
+    `step.take_step`."""
+    remaining = t1 - lanes.t
+    going = window.active & (lanes.h > 0) & (remaining > 0)
+    h = jnp.where(going, jnp.minimum(jnp.minimum(lanes.h, window.longest), remaining), 0.0)
+    clock = StepClock.of(osc, ones, lanes.t, h)
+    new = _attempt(osc, clock, window, lanes, rtol, atol, rates)
+    found = _meetings(osc, clock, window, lanes, new, rtol, atol)
+    delta = functools.reduce(jnp.minimum, [one.delta for one in found])
+    number = first_of(
+        [one.delta == delta for one in found], [one.number for one in found], jnp.asarray(-1)
+    )
+    reached = delta < NEVER
+    no = jnp.zeros_like(reached)
+    theta, cuts = jnp.ones_like(h), no
+    for one in found:
+        blocks = one.cut | (one.once & (one.delta >= NEVER))
+        sooner = blocks & (one.there < theta)
+        theta, cuts = jnp.where(sooner, one.there, theta), cuts | blocks
+        # What stands on a guard at once lands on it.
+        number = jnp.where(sooner & (one.there * h < NO_STEP), one.number, number)
+    blocked = cuts
+
+    last = h >= remaining
+    accepted = going & (new.error <= 1)
+    lands = accepted & ~blocked & reached & ~(last & (delta > 0))
+    outcome = jnp.where(accepted, jnp.where(blocked, -1.0, 1.0), 0.0)
+    outcome = materialise(jnp.where(lands, 2.0, outcome), ones)
+    shortened, kept, lands = outcome < 0, outcome > 0, outcome > 1
+    theta = materialise(theta, ones)
+    delta = lax.stop_gradient(materialise(jnp.where(lands, delta, 0.0), ones))
+    x1 = new.x1 + delta * (new.x2 + 0.5 * delta * new.rate)
+    x2 = new.x2 + delta * new.rate
+    t = jnp.where(last & ~lands, t1, lanes.t + h + delta)
+    pace, proposed = next_size(lanes, new, going, accepted)
+    proposed = jnp.where(window.stuck & accepted, 4 * h, proposed)
+    stands = shortened & (theta * h < NO_STEP)
+    proposed = jnp.where(shortened, theta * h, proposed)
+    proposed = jnp.where(stands, NO_STEP, proposed)
+    proposed = jnp.where(lands | stands, -proposed, proposed)
+    return replace(
+        lanes,
+        t=jnp.where(kept, t, lanes.t),
+        x1=jnp.where(kept, x1, lanes.x1),
+        x2=jnp.where(kept, x2, lanes.x2),
+        a=jnp.where(kept, new.a, lanes.a),
+        h=lax.stop_gradient(jnp.where(going, proposed, lanes.h)),
+        pace=lax.stop_gradient(jnp.where(accepted & ~window.stuck, pace, lanes.pace)),
+        hit=jnp.where(lands | stands, number, lanes.hit).astype(lanes.hit.dtype),
+        integrals=_integrated(rates, osc, lanes, new, delta, x1, x2, kept) if rates else None,
+    )
+
+
+def _integrated(rates, osc, lanes: Lanes, new: _Attempt, delta, x1, x2, kept) -> Any:
+    """The integrals after a step and the Taylor step behind it."""
+    t = lanes.t + new.h
+    ends = [(t, new.x1, new.x2), (t + delta, x1, x2)]
+    slopes = [rates(osc, lanes.mode, *end) for end in ends]
+    totals = jax.tree.map(lambda i, *s: i + 0.5 * delta * sum(s), new.integrals, *slopes)
+    return choose(kept, totals, lanes.integrals)
+
+
+def pass_events(
+    osc: Oscillator, lanes: Lanes, t1: Array, rtol: Array, *, captures: bool, derivatives: bool
+) -> tuple[Lanes, Passage]:
+    """Lanes that stand on a guard go on, see `events.pass_events`."""
+    landed = (lanes.h < 0) & ~lanes.done
+    fired = landed & (lanes.hit >= 0)
+
+    def through_guard(osc, mode, hit, x1, x2, t):
+        after = passed_guard(osc, mode, hit, on_guard_at(osc, mode, hit, (x1, x2, t)))
+        codes = Mode(tuple(code + jnp.zeros(()) for code in after.mode.codes))
+        forever = is_held_for_ever(osc, codes, after.y)
+        a = needed_or_rate(osc, codes, t, *after.y[:2])
+        return after.y[0], after.y[1], a, codes, after.captured, forever
+
+    no = jnp.zeros_like(fired)
+    state = lanes.x1, lanes.x2, lanes.a, lanes.mode, no, no
+    args = lanes.mode, lanes.hit, lanes.x1, lanes.x2, lanes.t
+    passed = where_any(fired, lambda: _of_lanes(through_guard, osc, *args), state)
+    x1, x2, a, mode, captured, forever = select(fired, passed, state)
+    captured = captured & captures
+    # Slip onset is tangent: x2' = 0 there up to rounding, for a law without a jump.
+    a = jnp.where(fired & ~mode.any_stuck, without_rounding(a, x1), a)
+    changed = any_of([p != q for p, q in zip(lanes.mode.codes, mode.codes, strict=True)])
+    happened = fired & changed
+    status = jnp.where(captured, Status.PSEUDO_FOCUS.value, lanes.status)
+    status = jnp.where(forever & fired, Status.STUCK_FOREVER.value, status)
+    passage = Passage(
+        landed=landed,
+        fired=happened,
+        number=lanes.hit,
+        before=lanes.mode,
+        mode=mode,
+        t=lanes.t,
+        x1=x1,
+        x2=x2,
+        captured=captured,
+        rests=no,
+        stuck=no,
+        duration=jnp.zeros_like(x1),
+        released=no,
+        forever=forever & fired,
+    )
+    lanes = replace(
+        lanes,
+        x1=x1,
+        x2=x2,
+        a=a,
+        # A stick phase is known beforehand.
+        h=jnp.where(fired, jnp.where(mode.any_stuck, LONGEST_STEP, first_step(rtol)), abs(lanes.h)),
+        pace=jnp.where(fired, STEP_SAFETY / first_step(rtol), lanes.pace),
+        mode=mode,
+        events=lanes.events + jnp.where(happened, 1, 0),
+        status=status,
+        done=lanes.done | captured | (lanes.t >= t1),
+        hit=jnp.where(landed, -1, lanes.hit).astype(lanes.hit.dtype),
+    )
+    return lanes, passage

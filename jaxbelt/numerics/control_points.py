@@ -1,0 +1,132 @@
+"""Whether a polynomial comes to zero between 0 and 1, by its control points.
+
+In the basis of Bernstein a polynomial lies within its control points, and it has no more roots,
+and no more extrema, than these have changes of sign, or of direction. So control points that are
+positive show that the polynomial is; those that only rise, or rise and then fall to a positive
+value, likewise; and those that are negative at the end and have fallen, or risen once before, or
+after, that it has passed zero once. What else there may be the caller asks of a shorter way.
+"""
+
+import functools
+from collections.abc import Sequence
+from itertools import pairwise
+from math import comb
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+#: Part of its range that a polynomial may be wrong by, and still be trusted to rise and fall as it
+#: does.
+TRUSTED = 0.25
+#: Newton steps to a root, or an extremum, from that of the control points.
+NEWTON_STEPS = 3
+
+
+class Passage(NamedTuple):
+    """Whether a function that is positive at 0 comes to zero up to 1, arrays of the batch shape.
+
+    once: it passes zero once, and is negative at 1; there: where. cut: it may pass zero and come
+    back, or may not, and is to be asked again up to `there`.
+    """
+
+    once: Array
+    cut: Array
+    there: Array
+
+
+def from_monomials(coefficients: Sequence[Array]) -> list[Array]:
+    """The control points of c0 + c1 theta + c2 theta^2 ..."""
+    n = len(coefficients) - 1
+    return [
+        functools.reduce(
+            jnp.add, [coefficients[k] * (comb(i, k) / comb(n, k)) for k in range(i + 1)]
+        )
+        for i in range(n + 1)
+    ]
+
+
+@functools.cache
+def through(nodes: tuple[float, ...]) -> np.ndarray:
+    """The matrix that makes control points of values at as many nodes in [0, 1]."""
+    x, n = np.array(nodes)[:, None], len(nodes) - 1
+    k = np.arange(n + 1)
+    binomials = np.array([comb(n, i) for i in k], dtype=float)
+    return np.linalg.inv(binomials * x**k * (1 - x) ** (n - k))
+
+
+def highest_difference(points: Sequence[Array]) -> Array:
+    """The coefficient of the highest power of theta."""
+    n = len(points) - 1
+    terms = [(-1) ** (n - i) * comb(n, i) * point for i, point in enumerate(points)]
+    return functools.reduce(jnp.add, terms)
+
+
+def value_at(points: Sequence[Array], theta: Array) -> tuple[Array, Array, Array]:
+    """The polynomial and its first two derivatives at theta, by de Casteljau's algorithm."""
+    n, row = len(points) - 1, list(points)
+    while len(row) > 3:
+        row = [p + theta * (q - p) for p, q in pairwise(row)]
+    first, second = row[1] - row[0], row[2] - row[1]
+    slope = first + theta * (second - first)
+    value = row[0] + theta * first + theta * slope
+    return value, n * slope, n * (n - 1) * (second - first)
+
+
+def passage(points: Sequence[Array], doubt: Array, rounding: Array, trust: Array) -> Passage:
+    """Whether a function comes to zero, of which a polynomial with these control points is known.
+
+    doubt: how far the polynomial may be off inside; its ends are exact up to `rounding`. trust:
+    where its shape is trusted whatever the doubt, because the way is as short as can be.
+    """
+    points, doubt, rounding = lax.stop_gradient((list(points), doubt, rounding))
+    steps = [q - p for p, q in pairwise(points)]
+    rises, falls = ([way * d > rounding for d in steps] for way in (1.0, -1.0))
+    seen_rise, seen_fall, peak, dip = rises[0], falls[0], None, None
+    for up, down in zip(rises[1:], falls[1:]):
+        peak = seen_rise & down if peak is None else peak | seen_rise & down
+        dip = seen_fall & up if dip is None else dip | seen_fall & up
+        seen_rise, seen_fall = seen_rise | up, seen_fall | down
+    assert peak is not None and dip is not None
+    least = functools.reduce(jnp.minimum, points)
+    spread = functools.reduce(jnp.maximum, points) - least
+    known = trust | (doubt <= TRUSTED * spread + rounding)
+    below = points[-1] < -rounding
+    above = functools.reduce(jnp.minimum, points[1:]) > doubt + rounding
+    once = known & below & ~(peak & dip)
+    stays = above & (points[0] > -rounding) | known & ~below & ~dip
+    root = _first_passage(points, -rounding)
+    dips = known & ~below & dip & ~peak & ~stays
+    guess = jnp.where(dips, _first_passage([-d for d in steps], rounding), root)
+    theta, lowest = _newton(points, guess, dips)
+    passes = dips & (lowest < -jnp.maximum(doubt, rounding))
+    inside = jnp.minimum(theta, 1 - theta) > 1e-3
+    splits = dips & ~passes & (lowest <= doubt + rounding) & inside & ~trust
+    unclear = ~(once | stays | dips)
+    # Newton's method may come to the root at 0 that began the way.
+    there = jnp.where(dips, theta, jnp.maximum(theta, 0.1 * root))
+    there = jnp.where(passes, jnp.minimum(root, theta), there)
+    return Passage(once, passes | splits | unclear, jnp.where(unclear, 0.5, there))
+
+
+def _first_passage(points: Sequence[Array], level: Array) -> Array:
+    """Where the line through the control points first goes below zero; 0 where it begins there."""
+    n = len(points) - 1
+    found = jnp.ones_like(points[0])
+    for i in reversed(range(n)):
+        p, q = points[i], points[i + 1]
+        part = jnp.clip(p / jnp.where(p > q, p - q, 1.0), 0.0, 1.0)
+        found = jnp.where((p >= level) & (q < level), (i + part) / n, found)
+    return jnp.where(points[0] < level, 0.0, found)
+
+
+def _newton(points: Sequence[Array], theta: Array, extreme: Array) -> tuple[Array, Array]:
+    """The root near theta, in [0, 1], or the extremum, and the value there."""
+    for _ in range(NEWTON_STEPS):
+        value, slope, bend = value_at(points, theta)
+        over, under = jnp.where(extreme, slope, value), jnp.where(extreme, bend, slope)
+        moved = theta - over / jnp.where(under == 0, 1.0, under)
+        theta = jnp.clip(jnp.where(jnp.isfinite(moved), moved, theta), 0.0, 1.0)
+    return theta, value_at(points, theta)[0]

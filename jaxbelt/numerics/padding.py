@@ -1,0 +1,41 @@
+"""Arrays made longer: so that few shapes are compiled, or to be cut into groups of one size."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..checks import pick
+
+
+def filled_up(tree: Any, rows: Any, size: int) -> Any:
+    """Some rows of a tree of known arrays, filled up to `size` with the last of them."""
+    return pick(tree, np.asarray(rows)[np.minimum(np.arange(size), len(rows) - 1)])
+
+
+def longer(tree: Any, size: int, *, axis: int = 0, fill: int | float | None = None) -> Any:
+    """The arrays of a tree made longer along an axis, up to `size`, with a number.
+
+    fill: that number; None: the last row of each array.
+    """
+
+    def one(leaf: Array) -> Array:
+        widths = [(0, 0)] * leaf.ndim
+        widths[axis] = (0, size - leaf.shape[axis])
+        if fill is None:
+            return jnp.pad(leaf, widths, "edge")
+        return jnp.pad(leaf, widths, constant_values=fill)
+
+    return jax.tree.map(one, tree)
+
+
+def in_groups_of(size: int, tree: Any, *, fill: int | float | None = None) -> Any:
+    """The rows of a tree of arrays in groups, [groups, size, ..], the last one made `longer`."""
+    return jax.tree.map(
+        lambda leaf: longer(leaf, -(-len(leaf) // size) * size, fill=fill).reshape(
+            -1, size, *leaf.shape[1:]
+        ),
+        tree,
+    )

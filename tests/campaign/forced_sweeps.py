@@ -1,0 +1,148 @@
+"""Final states of forced oscillators by `sweep`, against the engine's.
+
+A case of this campaign is a batch of runs of one structure, which is one call of the package.
+"""
+
+from dataclasses import replace
+from unittest import mock
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxbelt as jb
+from jaxbelt.model.own_units import in_units_of_run
+from jaxbelt.sweeps import question
+
+from . import forced, forced_cases
+from .outcome import Outcome
+from .package import Final
+from .runs import said as said
+
+#: Runs in one call, and structures, each a compilation.
+BATCH, PROGRAMS = 1024, 12
+_LAWS = {
+    "conti": jb.Conti,
+    "coulomb": jb.Coulomb,
+    "stribeck": jb.Stribeck,
+    "cubic": jb.Cubic,
+}
+_SIZES = {"conti": 4, "coulomb": 2, "stribeck": 3, "cubic": 3}
+
+
+def settings(options):
+    return dict(runs=options.runs, tol=options.tol, structure=options.structure)
+
+
+def numbers(options):
+    return range(len(_batches(options)))
+
+
+def _batches(options):
+    """A structure and a number of runs each."""
+    found = forced_cases.structures(np.random.default_rng(options.seed), PROGRAMS)
+    if options.structure is not None:
+        found = found[options.structure : options.structure + 1]
+    each = -(-options.runs // len(found))
+    return [
+        (structure, min(BATCH, each - first))
+        for structure in found
+        for first in range(0, each, BATCH)
+    ]
+
+
+def outcome(options, number):
+    structure, count = _batches(options)[number]
+    rng = np.random.default_rng((options.seed, number))
+    batch = [from_zero(forced_cases.case(rng, structure)) for _ in range(count)]
+    told = finals(batch, options.tol)
+    one = Outcome(f"{count} runs of {structure}")
+    verdicts = forced_cases.judged(batch, told, options.tol, options.threads)
+    for case, answer, (verdict, mine) in zip(batch, told, verdicts):
+        one.counts[f"{case.kind}|{verdict}|{options.what}|{options.tol:g}"] += 1
+        if verdict not in forced_cases.GOOD:
+            one.wrong.append(
+                f"{verdict}: {answer}; engine {mine.y_end} {mine.mode_end} {mine.status} "
+                f"{len(mine.t)} events, margin {mine.margin:.1e}\n  {case.to_json()}"
+            )
+    return one
+
+
+def from_zero(case):
+    """The same run that begins at t = 0: all of a sweep begin together."""
+
+    def later(wave):
+        if not isinstance(wave, forced.Oscillating | forced.Harmonic):
+            return wave
+        return replace(wave, phase=wave.phase + wave.frequency * case.t0)
+
+    osc = case.oscillator
+    belts = tuple(replace(b, velocity=later(b.velocity), load=later(b.load)) for b in osc.belts)
+    moved = replace(osc, belts=belts, forces=tuple(map(later, osc.forces)))
+    return replace(case, oscillator=moved, t0=0.0, T=round(case.T - case.t0, 9))
+
+
+def row_of(case):
+    """All numbers of a case in the order that `_from_numbers` takes them in."""
+    osc = case.oscillator
+    row = [osc.damping, osc.omega]
+    for b in osc.belts:
+        for wave in (b.velocity, b.load):
+            row += list(vars(wave).values()) if isinstance(wave, forced.Oscillating) else [wave]
+        law = [float(v) for v in b.law[1:]]
+        row += law + [0.0] * (_SIZES[b.law[0]] - len(law))
+        row += [b.lower, b.upper] if case.structure.edges else []
+    for f in osc.forces:
+        row += list(vars(f).values())
+    return [float(v) for v in row]
+
+
+def _from_numbers(structure, row):
+    values = iter(row)
+    damping, omega = next(values), next(values)
+
+    def wave(oscillates):
+        return jb.Oscillating(*(next(values) for _ in range(4))) if oscillates else next(values)
+
+    belts = []
+    rows = zip(structure.laws, structure.velocities, structure.loads, strict=True)
+    for law, moves, swells in rows:
+        velocity, load = wave(moves), wave(swells)
+        friction = _LAWS[law](*(next(values) for _ in range(_SIZES[law])))
+        edges = (next(values), next(values)) if structure.edges else ()
+        belts.append(jb.Belt(velocity, friction, load, *edges))
+    forces = tuple(jb.Harmonic(*(next(values) for _ in range(3))) for _ in range(structure.forces))
+    return jb.Oscillator(damping, tuple(belts), omega, forcing=forces)
+
+
+def swept(cases, observe, **options):
+    """The variables of `jb.sweep` over cases of one structure and one T, every number its own."""
+    structure = cases[0].structure
+    table = np.array([row_of(case) for case in cases])
+    starts = np.array([case.y0 for case in cases], dtype=float)
+
+    def leaves(row):
+        osc = in_units_of_run(_from_numbers(structure, row), edges=structure.edges)
+        return jnp.stack([jnp.asarray(leaf, float) for leaf in jax.tree.leaves(osc)])
+
+    whole = np.column_stack([starts, np.asarray(jax.vmap(leaves)(jnp.asarray(table)))])
+
+    class Cases(question.Grid):
+        def rows(self, runs, derivatives=()):
+            varying = [True, True, *self.mapped]
+            return whole[runs][:, varying].T[None]
+
+    def make(case):
+        return _from_numbers(structure, [value + 0 * case for value in table[0]])
+
+    with mock.patch.object(question, "Grid", Cases):
+        axes = {"case": np.arange(len(cases), dtype=float)}
+        return jb.sweep(make, axes, observe=observe, progress=False, **options)
+
+
+def finals(cases, tol, **options):
+    """Final states by the sweep."""
+    found = swept(cases, "final", t1=cases[0].T, rtol=tol, atol=tol, **options)
+    columns = found.x1_end, found.x2_end, found.mode_end, found.n_events, found.status
+    rows = zip(*(column.values for column in columns))
+    return [Final(float(a), float(b), tuple(m.tolist()), int(n), int(s)) for a, b, m, n, s in rows]
