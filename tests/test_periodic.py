@@ -280,7 +280,7 @@ def test_what_is_for_forced_oscillators_says_so():
         jb.lyapunov(still, (0.0, 0.0))
     with pytest.raises(ValueError, match="osc must be with a clock: PeriodDoubling is for"):
         jb.refine(jb.PeriodDoubling(), still, where=lambda o: o.belts[0].velocity)
-    with pytest.raises(ValueError, match="condition must be one for forced oscillators"):
+    with pytest.raises(ValueError, match="osc must be without a clock: NonsmoothFold is for"):
         jb.refine(jb.NonsmoothFold(0), bkn(1.7), where=frequency_of)
     with pytest.raises(ValueError, match="periods must be at most 32, got 33"):
         jb.periodic(bkn(1.7), (0.0, 0.0), periods=33)

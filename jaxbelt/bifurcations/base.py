@@ -168,8 +168,9 @@ class AbstractCondition(eqx.Module):
 
     def with_clock(self) -> Any:
         """The same condition for forced oscillators; a `ValueError` where there is none."""
-        expected = "one for forced oscillators, such as jb.PeriodDoubling()"
-        raise ValueError(f"condition must be {expected}, got {self!r}")
+        told = f"{type(self).__name__} is for oscillators that do not know the time"
+        other = "use a condition for forced ones, such as jb.PeriodDoubling()"
+        require(False, "osc", f"without a clock: {told}; {other}", "one with forcing")
 
     def as_data(self) -> Any:
         """The same condition with arrays for its numbers, as compiled programs take it."""

@@ -246,7 +246,7 @@ def _varied_by_two(osc: Oscillator, where: Any, at: Any, limits: np.ndarray) -> 
     if callable(where):
         values = tuple(np.mean(limits, axis=1).tolist() if at is None else at.tolist())
         make: Any = where
-        return Variation.of_function(make, values, "where")
+        return Variation.of_function(make, values, "where", forced=True)
     two = isinstance(where, tuple | list) and len(where) == 2
     require_value(two, "where", "two functions, or one of both parameters", where)
     require_value(at is None, "at", "left out where `where` selects the parameters", at)

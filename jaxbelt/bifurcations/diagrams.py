@@ -313,7 +313,7 @@ def _forced_diagram(osc: Any, where: Any, span: Any, start: Any) -> BifurcationD
     if isinstance(osc, Oscillator):
         leaf_index(osc, where)
     first, last = as_span(span, where)
-    given = varied(osc, where, (first,))
+    given = varied(osc, where, (first,), forced=True)
     for value in (first, last):
         given.check(value)
     ends = np.array([[0.5 * (first + last)], [first], [last]])

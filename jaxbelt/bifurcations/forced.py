@@ -177,7 +177,7 @@ class OnUnitCircle(TimedSystem):
         # -1 or 1 where the trace counts; else a pair.
         wanted = jnp.where(self.parts[1] > 0, -1.0, 1.0)
         found = motion.multipliers
-        is_there = jnp.min(jnp.abs(found - wanted)) < ON_CIRCLE
+        is_there = jnp.min(jnp.abs(found - wanted.astype(complex))) < ON_CIRCLE
         is_pair = jnp.abs(jnp.imag(found[0])) > ON_CIRCLE
         fits = jnp.where(self.parts[1] == 0, is_pair, is_there)
         other = (motion.status == Status.OK) & ~fits

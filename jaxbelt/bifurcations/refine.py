@@ -211,7 +211,7 @@ def _begun(
     require(at is not None, "at", "the value of the parameter to begin from", "None")
     at = as_array(at, "at")
     check_finite(at, "at")
-    variation = varied(osc, where, (at,))
+    variation = varied(osc, where, (at,), forced=True)
     if is_concrete(at):
         variation.check(float(at))
     value = at.reshape(1)

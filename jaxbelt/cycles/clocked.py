@@ -123,7 +123,7 @@ def timed_mesh(osc: Oscillator, size: int, codes: Array, y: Array, duration: Arr
     rho = jnp.clip(jnp.nan_to_num(rho, nan=1.0), 1.0, 100.0)
     share = jnp.concatenate([jnp.zeros(1), jnp.cumsum(0.5 * (rho[1:] + rho[:-1]))])
     count = jnp.clip(jnp.ceil(duration * share[-1] / n / STRIDE), 1, size)
-    places = jnp.minimum(jnp.arange(size + 1) / count, 1.0)
+    places = jnp.minimum(jnp.arange(size + 1.0) / count, 1.0)
     grid = jnp.interp(places, share / share[-1], jnp.linspace(0, 1, n + 1))
     return jnp.where(slips, jnp.diff(grid), jnp.zeros(size).at[0].set(1.0))
 
@@ -319,7 +319,7 @@ def multipliers_of(matrix: Array, sticks: Array) -> Array:
     trace = matrix[0, 0] + matrix[1, 1]
     det = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
     inner = 0.25 * trace**2 - det
-    root = jnp.sqrt(jnp.where(inner == 0, 1.0, jnp.abs(inner))) * (inner != 0)
+    root = jnp.where(inner == 0, 0.0, jnp.sqrt(jnp.where(inner == 0, 1.0, jnp.abs(inner))))
     largest = 0.5 * trace + jnp.where(trace < 0, -1.0, 1.0) * root
     none = largest == 0
     smallest = jnp.where(none, 0.0, det / jnp.where(none, 1.0, largest))

@@ -377,8 +377,8 @@ def motion_at(osc, chain, z, residual, iterations, status) -> PeriodicMotion:
 def _motion(osc, chain, z, residual, iterations, status) -> PeriodicMotion:
     known = jnp.where(status == Status.OK, 1.0, jnp.nan)
     found = multipliers_of(monodromy(osc, chain, z), sticks_in(chain))
-    numbers = iterations, status
-    return PeriodicMotion(osc, chain, z * known, found * known, residual * known, *numbers)
+    found, numbers = found * known.astype(complex), (residual * known, iterations, status)
+    return PeriodicMotion(osc, chain, z * known, found, *numbers)
 
 
 @jit

@@ -154,7 +154,12 @@ class Variation:
 
     @classmethod
     def of_function(
-        cls, make: Callable[..., Oscillator], values: Sequence[Any], argument: str = "osc"
+        cls,
+        make: Callable[..., Oscillator],
+        values: Sequence[Any],
+        argument: str = "osc",
+        *,
+        forced: bool = False,
     ) -> "Variation":
         """The oscillators that a function gives, `values` being some that are possible.
 
@@ -171,7 +176,8 @@ class Variation:
             told = f"one that returns {kind}{its_oscillator(osc, 'return')}"
             require(isinstance(osc, Oscillator), argument, expected, told)
             check_scalars(osc)
-            refuse_clock(osc, VARIED, "jb.simulate")
+            if not forced:
+                refuse_clock(osc, VARIED, "jb.simulate")
             leaves = jax.tree.leaves(osc)
             return [jnp.asarray(leaf) for leaf in leaves if is_real(leaf)]
 
@@ -557,7 +563,7 @@ def as_span(span: Any, where: Any) -> tuple[float, float]:
     return as_interval(span, "span")
 
 
-def varied(osc: Any, where: Any, values: Sequence[Any]) -> Variation:
+def varied(osc: Any, where: Any, values: Sequence[Any], *, forced: bool = False) -> Variation:
     """What an entry is to vary, by one parameter, from what it was given: an oscillator and
     `where`, or a function alone, or what is varied. values: a possible one of the parameter."""
     if isinstance(osc, Variation):
@@ -566,9 +572,10 @@ def varied(osc: Any, where: Any, values: Sequence[Any]) -> Variation:
         alone = "left out where osc is a function of the parameter"
         require_value(where is None, "where", alone, where)
         make: Any = osc
-        return Variation.of_function(make, values)
+        return Variation.of_function(make, values, forced=forced)
     check_oscillator(osc)
-    refuse_clock(osc, VARIED, "jb.simulate")
+    if not forced:
+        refuse_clock(osc, VARIED, "jb.simulate")
     return Variation.of_leaves(osc, [leaf_index(osc, where)])
 
 
