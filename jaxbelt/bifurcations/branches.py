@@ -137,7 +137,7 @@ class Leg(NamedTuple):
             return solved, (solved.u, unit * solved.u[-1:])
 
         begun = u, unit * (u + length * tangent)[-1:]
-        solved, settled = self.line.variation.settle(attempt, begun)
+        solved, settled = self.line.variation.relinearised(attempt, begun)
         return solved._replace(found=bool(solved.found) and bool(settled))
 
     def row(self, u: np.ndarray) -> Row:

@@ -52,7 +52,7 @@ from ..cycles.periodic import (
     periodic_from,
 )
 from ..cycles.shooting import jacobian
-from ..model.instants import guards_at, trend_of
+from ..model.instants import trend_of, guards_at
 from ..model.modes import STUCK, capacity, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator, at_time, check_clock
 from ..model.own_units import OwnOscillator, in_own_units, rescaled
