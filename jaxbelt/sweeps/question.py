@@ -31,7 +31,6 @@ from ..spelling import did_you_mean
 from .along import Along
 from .attractor import Attractor
 from .datasets import Table
-from .exponents import Exponents, ForcedAttractor
 from .grid import Grid
 from .moments import AtEvents, checked
 from .observers import Final, Reduce
@@ -41,9 +40,8 @@ from .reducers import check_reducer
 LONG_ENOUGH = 30_000.0
 #: Observers that have a name.
 NAMED: dict[str, type[Observer]] = {"final": Final, "attractor": Attractor}
-#: And those that have one where the oscillators know the time; attractor runs then end at this t1.
-NAMED_FORCED = NAMED | {"attractor": ForcedAttractor, "lyapunov": Exponents}
-LONG_ENOUGH_FORCED = 2_000.0
+#: And those where the oscillators know the time.
+NAMED_FORCED: dict[str, type[Observer]] = {"final": Final}
 #: Largest number of points of the grid that identify `make`; the same on every machine.
 SAMPLE = 2**14
 
@@ -67,7 +65,7 @@ class Question:
         if t1 is None:
             given = 'given, the end of each run, but for observe="attractor"'
             require(observe == "attractor", "t1", given, "None")
-            t1 = LONG_ENOUGH_FORCED if clock else LONG_ENOUGH
+            t1 = LONG_ENOUGH
         numbers = settings_of_runs(t1, rtol, atol)
         if clock:
             numbers["t0"] = as_start(t0, numbers["t1"])
@@ -204,6 +202,8 @@ def _observer(observe: Any, clock: bool) -> Observer:
         return observe
     known = NAMED_FORCED if clock else NAMED
     if isinstance(observe, str):
+        instead = "for oscillators without a clock; of one that is forced use jb.find_cycle"
+        require(not (clock and observe == "attractor"), "observe", instead, '"attractor"')
         require_one_of(observe, known, "observe", " or an object with init, update, finish")
         return known[observe]()
     methods = ("init", "update", "finish")
