@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 import jaxbelt as jb
-
-from .campaign import forced
+from tests.campaign import forced
 
 
 def _cubic(amplitude, frequency):

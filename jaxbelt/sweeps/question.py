@@ -173,6 +173,10 @@ class Question:
             if not all(map(_is_ours, kinds)):
                 names = f"{names}, {fingerprint(belt.friction, f'the law of belt {i}')}"
             identity[f"the law of belt {i}"] = f"{shown} of {names}"
+        for i, force in enumerate(grid.example.forcing):
+            kind = type(force)
+            own = "" if _is_ours(kind) else f", {fingerprint(force, f'force {i}')}"
+            identity[f"force {i}"] = kind.__qualname__ + own
         identity |= {name: repr(value) for name, value in self.numbers.items()}
         identity["observe"] = repr(self.observe)
         if not isinstance(self.observe, str):
