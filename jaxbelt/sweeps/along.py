@@ -265,7 +265,7 @@ class Along(Observer):
 
         def pending(state):
             seen, tables = state
-            due = [jnp.any(self._due(seen, after))]
+            due = [jnp.any(self._due(seen, osc, after))]
             return jnp.any(jnp.stack(due + [jnp.any(jnp.isfinite(_first(t))) for t in tables]))
 
         def ask(state):

@@ -320,7 +320,7 @@ def basins(
         ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(oscillator, "oscillator")
-    refuse_clock(oscillator, "basins", 'jb.sweep with axes x1 and x2 and observe="attractor"')
+    refuse_clock(oscillator, "basins", "jb.sweep with axes x1 and x2")
     axes = {name: _starts_along(values, name) for name, values in (("x1", x1), ("x2", x2))}
     require_wish(progress, "progress")
     with Activity("basins", progress):
@@ -497,9 +497,7 @@ def basin_stability(
         ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(oscillator, "oscillator")
-    refuse_clock(
-        oscillator, "basin_stability", 'jb.sweep with axes x1 and x2 and observe="attractor"'
-    )
+    refuse_clock(oscillator, "basin_stability", "jb.sweep with axes x1 and x2")
     corners, n = as_box(box), as_whole(n, "n")
     check_key(key)
     numbers = settings_of_runs(t1, rtol, atol)

@@ -210,7 +210,7 @@ def basin_fractions(
     numbers = settings_of_runs(t1, rtol, atol)
     moves = None if moves is None else as_positive(moves, "moves")
     given = varied(osc, where, (first,))
-    instead = 'jb.sweep with axes x1 and x2 and observe="attractor"'
+    instead = "jb.sweep with axes x1 and x2"
     refuse_clock(given.oscillator(np.array([first])), "basin_fractions", instead)
     for value in (first, last):
         given.check(value)

@@ -74,6 +74,9 @@ class Grid:
         self.edges = True
         self.mapped = traceable(self._varying, "make", returns)
         own = in_units_of_run(self.example, edges=True)
+        alike = len(self.mapped) == len(jax.tree.leaves(own))
+        expected = "frequencies other than 0, which make a constant force"
+        require(alike, "axes", expected, "0 as the first value of one")
         which = jax.tree.unflatten(jax.tree.structure(own), self.mapped)
         self.edges = has_edges(own) or any(map(bool, interval_ends(which)))
         leaves, self.structure = jax.tree.flatten(in_units_of_run(self.example, edges=self.edges))

@@ -108,8 +108,6 @@ class AtPhase:
     Attributes:
         phase: An angle.
 
-    Example:
-        diagram = jb.orbit_diagram(osc, where, (1.6, 1.8), at=jb.AtPhase())
     """
 
     phase: float = 0.0

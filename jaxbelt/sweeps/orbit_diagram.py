@@ -29,7 +29,7 @@ from ..checks import (
     require_value,
 )
 from ..cycles.attractors import RUN
-from ..model.oscillator import Oscillator, frequencies, has_clock
+from ..model.oscillator import Oscillator, frequencies, refuse_clock
 from ..model.parameters import leaf_index
 from ..model.variations import Variation, as_span, varied
 from ..numerics.spacing import evenly_spaced
@@ -156,7 +156,7 @@ def orbit_diagram(
     where: Callable[[Oscillator], Any] | None = None,
     span: tuple[float, float] | None = None,
     *,
-    at: AtExtrema | AtSection | AtEvents | AtPhase | None = None,
+    at: AtExtrema | AtSection | AtEvents | None = None,
     y0: ArrayLike | Sequence[Any] = (3.0, 0.0),
     rows: int = 400,
     rtol: ArrayLike = 1e-8,
@@ -196,13 +196,10 @@ def orbit_diagram(
     variation = varied(osc, where, (first,))
     rows = as_whole(rows, "rows", 2)
     example = variation.oscillator(np.array([first]))
-    if has_clock(example):
-        at = AtPhase() if at is None else at
-        require_value(isinstance(at, AtPhase), "at", "an AtPhase, as osc is forced", at)
-    else:
-        at = AtExtrema("x1") if at is None else at
-        kinds = AtExtrema | AtSection | AtEvents
-        require_value(isinstance(at, kinds), "at", "an AtExtrema, AtSection or AtEvents", at)
+    refuse_clock(example, "orbit_diagram", "jb.bifurcation_diagram or jb.sweep")
+    at = AtExtrema("x1") if at is None else at
+    kinds = AtExtrema | AtSection | AtEvents
+    require_value(isinstance(at, kinds), "at", "an AtExtrema, AtSection or AtEvents", at)
     check_sections((at,), example)
     return Sampling(variation, at, starts, rows, numbers).diagram((first, last))
 

@@ -31,7 +31,6 @@ from ..spelling import did_you_mean
 from .along import Along
 from .attractor import Attractor
 from .datasets import Table
-from .exponents import Exponents, ForcedAttractor
 from .grid import Grid
 from .moments import AtEvents, checked
 from .observers import Final, Reduce
@@ -41,9 +40,8 @@ from .reducers import check_reducer
 LONG_ENOUGH = 30_000.0
 #: Observers that have a name.
 NAMED: dict[str, type[Observer]] = {"final": Final, "attractor": Attractor}
-#: And those that have one where the oscillators know the time; attractor runs then end at this t1.
-NAMED_FORCED = NAMED | {"attractor": ForcedAttractor, "lyapunov": Exponents}
-LONG_ENOUGH_FORCED = 2_000.0
+#: And those where the oscillators know the time.
+NAMED_FORCED: dict[str, type[Observer]] = {"final": Final}
 #: Largest number of points of the grid that identify `make`; the same on every machine.
 SAMPLE = 2**14
 
@@ -67,7 +65,7 @@ class Question:
         if t1 is None:
             given = 'given, the end of each run, but for observe="attractor"'
             require(observe == "attractor", "t1", given, "None")
-            t1 = LONG_ENOUGH_FORCED if clock else LONG_ENOUGH
+            t1 = LONG_ENOUGH
         numbers = settings_of_runs(t1, rtol, atol)
         if clock:
             numbers["t0"] = as_start(t0, numbers["t1"])
@@ -175,6 +173,10 @@ class Question:
             if not all(map(_is_ours, kinds)):
                 names = f"{names}, {fingerprint(belt.friction, f'the law of belt {i}')}"
             identity[f"the law of belt {i}"] = f"{shown} of {names}"
+        for i, force in enumerate(grid.example.forcing):
+            kind = type(force)
+            own = "" if _is_ours(kind) else f", {fingerprint(force, f'force {i}')}"
+            identity[f"force {i}"] = kind.__qualname__ + own
         identity |= {name: repr(value) for name, value in self.numbers.items()}
         identity["observe"] = repr(self.observe)
         if not isinstance(self.observe, str):
@@ -204,6 +206,8 @@ def _observer(observe: Any, clock: bool) -> Observer:
         return observe
     known = NAMED_FORCED if clock else NAMED
     if isinstance(observe, str):
+        instead = "for oscillators without a clock; of one that is forced use jb.find_cycle"
+        require(not (clock and observe == "attractor"), "observe", instead, '"attractor"')
         require_one_of(observe, known, "observe", " or an object with init, update, finish")
         return known[observe]()
     methods = ("init", "update", "finish")
@@ -213,6 +217,8 @@ def _observer(observe: Any, clock: bool) -> Observer:
     expected = f"{names} or an object with init, update, finish"
     require_value(fits, "observe", expected, observe)
     if hasattr(observe, "at") or hasattr(observe, "rates"):
+        told = "without `at` and `rates` where the oscillators are forced"
+        require(not clock, "observe", told, type(observe).__name__)
         checked(getattr(observe, "at", (AtEvents(),)))
         return Along(observe)
     return Reduce(observe)

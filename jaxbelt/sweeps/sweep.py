@@ -81,18 +81,13 @@ def sweep(
       it was reached), n_events (of a cycle in one loop, else until it was known). An undecided run
       has no attractor: all of these are NaN, sticks is false, signature "none", and n_events those
       of the run. Runs end as soon as their attractor is known, see `attractor.Attractor`.
-      Where the oscillators are forced: kind (periodic, "quasiperiodic or chaotic", where the
-      largest exponent is above zero by three standard errors, stuck, or undecided), periods (of the
-      forcing, in one of the motion), and the variables of `"lyapunov"`; runs go on until t1.
-    - `"lyapunov"`, where the oscillators are forced: exponent (the largest Lyapunov exponent per
-      unit of time, with saltation, averaged over three quarters of the run), exponent_error (its
-      standard error), second_exponent (-inf where the mass sticks), sticks(belt), n_events.
+      Not for oscillators that are forced.
     - an object with three methods for scalars: `init(osc, x1, x2)` returns the state of a run, any
       tree of arrays; `update(state, event)` the state after an `observers.RunEvent` (t, x1, x2,
       kind, belt); `finish(state, end)` a dictionary of results, numbers or vectors, from the state
       and an `observers.RunEnd` (t, x1, x2, status). They are traced, so use `jax.numpy`. With the
       attribute `at`, a tuple of the moments `AtEvents()`, `AtExtrema("x1")`, `AtSection(function)`,
-      `AtTimes(times)` and, with forcing, `AtPhase(phase)`, `update` is called at these; with a
+      `AtTimes(times)`, not where the oscillators are forced, `update` is called at these; with a
       method `rates(osc, motion)`, which returns a tree of numbers, their integrals are in
       event.integrals and end.integrals, see `along.Motion`.
     - a `lanes.Observer`, the base class of the first two.
@@ -105,7 +100,7 @@ def sweep(
             the oscillator at the first finite value of each axis has to be possible.
         y0: Start (x1, x2), where it is not on an axis.
         t1: End of each run (dimensionless time tau = omega t). The default for attractors is
-            30,000, and 2,000 where the oscillators are forced.
+            30,000.
         t0: Time at which each run begins, which matters where the oscillator is forced.
         rtol: Relative tolerance of a step.
         atol: Absolute tolerance of a step, a length; None: 1e-8 of the oscillator's own size.
