@@ -322,10 +322,10 @@ class AbstractForcedCondition(AbstractCondition):
         system = guess.system(chain)
         return _refined(osc, system, z), z, jnp.asarray(Status.OK.value)
 
-    def solved(self, family, system, x, p, status):
+    def point_near(self, family, system, x, p, status):
         return _solved_point(family, system, x, p, status)
 
-    def followed(self, point):
+    def system_at(self, point):
         motion = point.cycle
         some = min(
             self.beginnings_of(point.oscillator, motion, known=True), key=lambda one: one.distance
