@@ -92,7 +92,7 @@ class TimedSystem(AbstractSystem):
         """What vanishes there."""
         raise NotImplementedError
 
-    def condition_and_slopes(self, osc_of: Any, z: Array, p: Array):
+    def condition_and_slopes(self, osc_of: Any, z: Array, p: Array) -> Any:
         """The condition at the parameters p, and its derivatives by z and p."""
         return jax.value_and_grad(lambda z, p: self.condition(osc_of(p), z), (0, 1))(z, p)
 

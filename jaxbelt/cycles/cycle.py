@@ -490,9 +490,7 @@ MORE_BUDGETS = 15
 
 
 @announced("find_cycle")
-def find_cycle(
-    osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None = None
-) -> Cycle | PeriodicMotion:
+def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None = None) -> Any:
     """The steady cycle that a start leads to.
 
     The orbit is followed until a loop repeats (up to some thousand loops, under a transformation a
