@@ -370,7 +370,7 @@ class BifurcationPoint(eqx.Module):
     multiplier: Array
     x1: Array = eqx.field(metadata=quantity("length"))
     oscillator: Oscillator
-    cycle: Cycle
+    cycle: Any
     status: Array
     member: ArrayLike = 0
     sides: tuple[Side, ...] = ()
@@ -544,7 +544,7 @@ UNNAMED = Unexplained()
 
 
 def point_of(
-    family: Family, solution: Solution, cycle: Cycle, multiplier: Array, status: Array
+    family: Family, solution: Solution, cycle: Any, multiplier: Array, status: Array
 ) -> BifurcationPoint:
     """The point of a solution, NaN where the status is not OK."""
     status = judged_by(solution.error, family, status)

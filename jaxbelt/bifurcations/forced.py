@@ -92,7 +92,7 @@ class TimedSystem(AbstractSystem):
         """What vanishes there."""
         raise NotImplementedError
 
-    def condition_and_slopes(self, osc_of: Any, z: Array, p: Array):
+    def condition_and_slopes(self, osc_of: Any, z: Array, p: Array) -> Any:
         """The condition at the parameters p, and its derivatives by z and p."""
         return jax.value_and_grad(lambda z, p: self.condition(osc_of(p), z), (0, 1))(z, p)
 
@@ -322,10 +322,10 @@ class AbstractForcedCondition(AbstractCondition):
         system = guess.system(chain)
         return _refined(osc, system, z), z, jnp.asarray(Status.OK.value)
 
-    def solved(self, family, system, x, p, status):
+    def point_near(self, family, system, x, p, status):
         return _solved_point(family, system, x, p, status)
 
-    def followed(self, point):
+    def system_at(self, point):
         motion = point.cycle
         some = min(
             self.beginnings_of(point.oscillator, motion, known=True), key=lambda one: one.distance

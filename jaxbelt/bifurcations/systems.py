@@ -360,7 +360,7 @@ def nearest_edge(osc: Oscillator, chain: Chain, z: Array, without: bool | Array 
 class _InParameter(Equations):
     """The equations of a system in its own unknowns and one parameter, in units of that."""
 
-    system: CycleSystem
+    system: Any
 
     def residual(self, given, z):
         own, p = z
@@ -387,7 +387,7 @@ class Solution(NamedTuple):
     status: Array
 
 
-def solve_system(family: Family, system: CycleSystem, z0, p0, status: Array) -> Solution:
+def solve_system(family: Family, system: Any, z0, p0, status: Array) -> Solution:
     """The solution of a system near (z0, p0); status: of that guess."""
     # Without a guess Newton's method ends at once.
     z0 = jnp.where(status == Status.OK, z0, jnp.nan)
@@ -404,7 +404,7 @@ def solve_system(family: Family, system: CycleSystem, z0, p0, status: Array) -> 
     return Solution(z, p, steps, iterations, residual, unit * error, status)
 
 
-def _accuracy(osc: Oscillator, system: CycleSystem, z: Array, matrix: Array):
+def _accuracy(osc: Oscillator, system: Any, z: Array, matrix: Array):
     """The residual, and a bound on the error of p, in its units.
 
     The bound is the effect of the residual with halved steps, and of rounding.
@@ -416,7 +416,7 @@ def _accuracy(osc: Oscillator, system: CycleSystem, z: Array, matrix: Array):
     return jnp.max(jnp.abs(values[0])), 2 * jnp.abs(jnp.sum(weights * values[1])) + rounding
 
 
-def on_both_meshes(system: CycleSystem, value: Callable[[CycleSystem], Any]) -> Any:
+def on_both_meshes(system: Any, value: Callable[[Any], Any]) -> Any:
     """A value of the system with its integration steps as they are, and with all of them halved."""
     mesh = system.chain.mesh
     # Padded by steps of length zero to one shape.

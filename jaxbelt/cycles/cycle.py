@@ -40,7 +40,7 @@ from ..results import Status, describe, draw
 from ..tables import per_belt, require_single, table_of
 from .chains import SIZES, Chain, Loop, loop_events, modes_of, room_of
 from .orbits import MOST_ARCS, follow, last_loop, loop_of
-from .periodic import PeriodicMotion, motion_reached
+from .periodic import motion_reached
 from .shooting import (
     ARC_STEPS,
     Ends,
@@ -490,9 +490,7 @@ MORE_BUDGETS = 15
 
 
 @announced("find_cycle")
-def find_cycle(
-    osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None = None
-) -> Cycle | PeriodicMotion:
+def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None = None) -> Any:
     """The steady cycle that a start leads to.
 
     The orbit is followed until a loop repeats (up to some thousand loops, under a transformation a
