@@ -25,7 +25,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     cycles/         attractors functionals
     cycles/         backwards returns separatrices portrait unstable
     cycles/         outlines nearest sides shocks
-    sweeps/         observers moments along reducers attractor exponents queue threads audit
+    sweeps/         observers moments along reducers attractor queue threads audit
     sweeps/         grid datasets question locks store progress work clusters sweep shares basins
     sweeps/         fractions orbit_diagram
     bifurcations/   special labels beside systems guesses base conditions forced tangencies

@@ -67,13 +67,13 @@ def sides_of(
     known = [[one for one in some if one.path] for some in cycles]
     places = [[place_of(one.loop) for one in some] for some in known]
     first, last = (
-        _side(values[i], oscs[i], oscs[1 - i], known[i], places[i], known[1 - i], places[1 - i])
+        _side_at(values[i], oscs[i], oscs[1 - i], known[i], places[i], known[1 - i], places[1 - i])
         for i in (0, 1)
     )
     return first, last
 
 
-def _side(value, osc, across, cycles, places, others, other_places) -> Side:
+def _side_at(value, osc, across, cycles, places, others, other_places) -> Side:
     ok, rests = jnp.asarray(Status.OK.value), equilibria(osc)
     ended = [
         exactly(osc, cut([one.loop])[0], ok)

@@ -19,7 +19,7 @@ from jaxtyping import Array
 
 from ..activity import note_progress
 from ..cycles.clocked import TimedChain, timed_blocks, turns_of
-from ..cycles.periodic import PeriodicMotion, is_same, motion_at, periodic_from
+from ..cycles.periodic import PeriodicMotion, is_same_motion, motion_at, periodic_from
 from ..cycles.shooting import jacobian
 from ..model.oscillator import Oscillator
 from ..model.own_units import in_own_units
@@ -86,11 +86,11 @@ def forced_branches(
     branches, points, waiting = [], [], [(Row(value, start), True)]
     while waiting:
         row, is_first = waiting.pop(0)
-        sides = [_side(line, row, sign) for sign in (-1.0, 1.0)]
+        sides = [_side_of_point(line, row, sign) for sign in (-1.0, 1.0)]
         (behind, before), (ahead, after) = sides
         branches.append([*reversed(behind[1:]), *ahead])
         for point in (*before, *after):
-            if any(_is_known(point, one, line) for one in points):
+            if any(_is_known_motion(point, one, line) for one in points):
                 continue
             points.append(point)
             if is_first and isinstance(point.condition, PeriodDoubling):
@@ -99,13 +99,13 @@ def forced_branches(
     return branches, sorted(points, key=lambda point: float(point.value))
 
 
-def _is_known(point: BifurcationPoint, other: BifurcationPoint, line: Line) -> bool:
+def _is_known_motion(point: BifurcationPoint, other: BifurcationPoint, line: Line) -> bool:
     close = abs(float(point.value) - float(other.value)) < 1e-8 * line.length
     return close and type(point.condition) is type(other.condition) and _same(point, other)
 
 
 def _same(point: BifurcationPoint, other: BifurcationPoint) -> bool:
-    return is_same(point.cycle, other.cycle)
+    return is_same_motion(point.cycle, other.cycle)
 
 
 # --- one leg: a fixed signature -------------------------------------------------------------------
@@ -133,7 +133,7 @@ class Leg(NamedTuple):
             start, _ = unknowns
             ahead = length if start is u else 0.0
             args = family, self.chain, self.weights, jnp.asarray(unit)
-            solved = corrected(_linearized, args, start, tangent, ahead)
+            solved = corrected(_linearized_motion, args, start, tangent, ahead)
             return solved, (solved.u, unit * solved.u[-1:])
 
         begun = u, unit * (u + length * tangent)[-1:]
@@ -143,10 +143,12 @@ class Leg(NamedTuple):
     def row(self, u: np.ndarray) -> Row:
         z = (u[:-1] / np.asarray(self.weights)).reshape(-1, 4)
         value = float(self.line.length * u[-1])
-        return Row(value, _motion_of(self.line.at(value), self.chain, jnp.asarray(z)))
+        return Row(value, _motion_of_row(self.line.at(value), self.chain, jnp.asarray(z)))
 
 
-def _linearized(u: Array, args: tuple[Family, TimedChain, Array, Array]) -> tuple[Array, Array]:
+def _linearized_motion(
+    u: Array, args: tuple[Family, TimedChain, Array, Array]
+) -> tuple[Array, Array]:
     family, chain, weights, unit = args
     z, p = (u[:-1] / weights).reshape(-1, 4), unit * u[-1:]
     value, blocks = timed_blocks(family.at(p), jax.jacfwd(family.at)(p), chain, z)
@@ -155,22 +157,22 @@ def _linearized(u: Array, args: tuple[Family, TimedChain, Array, Array]) -> tupl
 
 
 @jit
-def _motion_of(osc: Oscillator, chain: TimedChain, z: Array) -> PeriodicMotion:
+def _motion_of_row(osc: Oscillator, chain: TimedChain, z: Array) -> PeriodicMotion:
     none = jnp.zeros((), int)
     return motion_at(osc, chain, z, jnp.zeros(()), none, none)
 
 
-def _side(line: Line, row: Row, sign: float) -> tuple[list[Row], list[BifurcationPoint]]:
+def _side_of_point(line: Line, row: Row, sign: float) -> tuple[list[Row], list[BifurcationPoint]]:
     """The branch to one side of a motion: leg by leg."""
     rows, points = [row], []
     while len(rows) < MOST_ROWS:
         note_progress(f"{len(rows)} motions on one side")
-        ahead, found, direction = _leg(line, rows[-1], sign)
+        ahead, found, direction = _branch_leg(line, rows[-1], sign)
         rows += ahead
         points += found
         if direction is None:
             break
-        further = _beyond(line, rows[-1], found[-1], direction)
+        further = _beyond_point(line, rows[-1], found[-1], direction)
         if further is None:
             break
         new, sign = further
@@ -178,7 +180,7 @@ def _side(line: Line, row: Row, sign: float) -> tuple[list[Row], list[Bifurcatio
     return rows, points
 
 
-def _leg(
+def _branch_leg(
     line: Line, row: Row, sign: float
 ) -> tuple[list[Row], list[BifurcationPoint], float | None]:
     """The motions after a row with its signature, the points on the way, and the sense in which the
@@ -208,7 +210,7 @@ def _leg(
                 return rows, [*points, point], float(np.sign(tangent[-1]))
             step *= 0.5
             continue
-        points += list(_between(line, last, new))
+        points += list(_between_rows(line, last, new))
         rows.append(new)
         step = min(LONGEST, 1.5 * step)
         u, tangent, last = solved.u, solved.tangent, new
@@ -236,7 +238,7 @@ def _tests(motion: PeriodicMotion) -> dict[type[AbstractForcedCondition], float]
     return {PeriodDoubling: 1 + trace + det, Fold: 1 - trace + det, Torus: torus}
 
 
-def _between(line: Line, one: Row, other: Row) -> Iterator[BifurcationPoint]:
+def _between_rows(line: Line, one: Row, other: Row) -> Iterator[BifurcationPoint]:
     """The points of multipliers between two motions of one signature."""
     before, after = _tests(one.motion), _tests(other.motion)
     for kind in before:
@@ -244,7 +246,7 @@ def _between(line: Line, one: Row, other: Row) -> Iterator[BifurcationPoint]:
             continue
         nearer = min((one, other), key=lambda row: abs(_tests(row.motion)[kind]))
         found = _points(line, kind(), nearer)
-        fine = [point for point in found if _is_beside(line, point, one, other)]
+        fine = [point for point in found if _rows_are_beside(line, point, one, other)]
         yield from fine[:1]
 
 
@@ -254,7 +256,7 @@ def _points(line: Line, condition: AbstractCondition, row: Row) -> list[Bifurcat
     return [replace(p, condition=condition) for p in found if int(p.status) == Status.OK]
 
 
-def _is_beside(line: Line, point: BifurcationPoint, one: Row, other: Row) -> bool:
+def _rows_are_beside(line: Line, point: BifurcationPoint, one: Row, other: Row) -> bool:
     """Whether a point is as near to two motions as they are to each other, about."""
     starts = np.asarray(one.motion.start), np.asarray(other.motion.start)
     apart = np.max(np.abs(starts[0] - starts[1])) + 1e-6
@@ -269,12 +271,12 @@ def _border(line: Line, last: Row, new: Row, change: float) -> BifurcationPoint 
     belts = range(last.motion.chain.codes.shape[-1])
     kinds: list[Any] = [GrazingSliding, CrossingSliding, SwitchingSliding, AddingSliding]
     found = [p for k in kinds for belt in belts for p in _points(line, k(belt), last)]
-    near = [p for p in found if _is_beside(line, p, last, new)]
+    near = [p for p in found if _rows_are_beside(line, p, last, new)]
     ahead = [p for p in near if (float(p.value) - last.value) * change >= -1e-9 * line.length]
     return min(ahead, key=lambda p: abs(float(p.value) - last.value), default=None)
 
 
-def _beyond(
+def _beyond_point(
     line: Line, last: Row, point: BifurcationPoint, direction: float
 ) -> tuple[Row, float] | None:
     """A motion beyond the point in which a signature ended, and the sense in which to go on."""
@@ -293,7 +295,7 @@ def _beyond(
                 fine = int(motion.status) == Status.OK and motion.periods == periods
                 if not fine or np.max(np.abs(np.asarray(motion.start) - at)) > NEAR:
                     continue
-                if own is not None and is_same(own, motion):
+                if own is not None and is_same_motion(own, motion):
                     continue
                 return Row(there, motion), side * direction
     return None

@@ -226,7 +226,7 @@ class SaddleConnection(AbstractCondition):
 
     def orbit(self, point):
         system, x = self.system_at(point)
-        states = np.asarray(_states_along(point.oscillator, system, x))
+        states = np.asarray(_states_on(point.oscillator, system, x))
         return states[np.asarray(system.chain.used)].reshape(-1, 2)
 
     def limit(self, trail):
@@ -275,7 +275,7 @@ def _solved_at(osc: Oscillator, system: Connection, x: Array) -> Array:
 
 
 @jit
-def _states_along(osc: Oscillator, system: Connection, x: Array) -> Array:
+def _states_on(osc: Oscillator, system: Connection, x: Array) -> Array:
     """States along each arc, its ends included, [arcs, samples, 2]."""
 
     def arc(row):

@@ -318,12 +318,12 @@ class AbstractForcedCondition(AbstractCondition):
 
     def prepared(self, osc, guess):
         loop = guess.rows.loop()
-        chain, z = _chain_of(osc, loop, least_steps(osc, loop), turns_of(osc))
+        chain, z = _chain_of_motion(osc, loop, least_steps(osc, loop), turns_of(osc))
         system = guess.system(chain)
         return _refined(osc, system, z), z, jnp.asarray(Status.OK.value)
 
     def point_near(self, family, system, x, p, status):
-        return _solved_point(family, system, x, p, status)
+        return _solved_timed_point(family, system, x, p, status)
 
     def system_at(self, point):
         motion = point.cycle
@@ -338,7 +338,7 @@ class AbstractForcedCondition(AbstractCondition):
         return place_of_motion(point.cycle)
 
 
-_chain_of = jit(timed_chain)
+_chain_of_motion = jit(timed_chain)
 
 
 @jit
@@ -347,7 +347,7 @@ def _refined(osc: Oscillator, system: TimedSystem, x: Array) -> TimedSystem:
 
 
 @jit
-def _solved_point(family, system, z0, p0, status):
+def _solved_timed_point(family, system, z0, p0, status):
     solution = solve_system(family, system, z0, p0, status)
     osc, z = family.at(solution.p), solution.z
     numbers = solution.residual, solution.iterations, solution.status

@@ -120,10 +120,10 @@ class EdgeExchange(AbstractCycleCondition, _BetweenEdges):
 
     def distance(self, osc: Oscillator, loop: Loop) -> Array:
         """Distance between the edges that the loop passes."""
-        return _passage(osc, loop, self.belts)[0]
+        return _passage_of_edges(osc, loop, self.belts)[0]
 
     def system(self, osc, loop, status):
-        distance, row, pair = _passage(osc, loop, self.belts)
+        distance, row, pair = _passage_of_edges(osc, loop, self.belts)
         exists = jnp.isfinite(distance) & _both_rub(osc, self.belts)
         status = jnp.where(exists | (status != Status.OK), status, Status.NOT_TOUCHED.value)
         chain, z = meshed(osc, loop)
@@ -134,7 +134,7 @@ class EdgeExchange(AbstractCycleCondition, _BetweenEdges):
         return [cls((belts[0], belts[1]))] if before.cycles != after.cycles else []
 
 
-def _passage(osc: Oscillator, loop: Loop, belts) -> tuple[Array, Array, TwoEdges]:
+def _passage_of_edges(osc: Oscillator, loop: Loop, belts) -> tuple[Array, Array, TwoEdges]:
     """The place where a loop passes an edge of each belt in succession and these are nearest.
 
     Returns the distance of the edges, inf if there is no such place, the row that ends on the first

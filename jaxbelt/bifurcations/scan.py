@@ -141,7 +141,7 @@ def search(
     """
     calls = chain(_calls_ahead(path), ahead)
     with compiled_beside(f"path {len(ahead)}", path.at(path.first), calls):
-        return _searched(path, resolution, near, known)
+        return _searched_interval(path, resolution, near, known)
 
 
 def _calls_ahead(path: ParameterPath) -> Iterator[Callable[[], Any]]:
@@ -161,7 +161,7 @@ def _calls_ahead(path: ParameterPath) -> Iterator[Callable[[], Any]]:
         yield functools.partial(condition.point_from, path.variation, at, beginning)
 
 
-def _searched(
+def _searched_interval(
     path: ParameterPath, resolution: int, near: float, known: Sequence[BifurcationPoint]
 ) -> tuple[BifurcationPoint, ...]:
     points = [point for at in path.breaks for point in _at_break(path, at)]

@@ -55,7 +55,7 @@ LEAST_STEPS, PLACING = 8 * ARC_STEPS, 2
 #: Periods of forces have a common multiple if their ratios have denominators up to this.
 RATIOS = 64
 #: A boundary or limit that is passed by less is touched.
-TOUCHES = 1e-8
+TOUCHES_AGAIN = 1e-8
 
 
 class TimedChain(Chain):
@@ -88,12 +88,12 @@ def forcing_period(osc: Oscillator, turns: int) -> Array:
 
 def least_steps(osc: Oscillator, loop: Loop) -> int:
     """The size of a mesh that the arcs of a known loop need; see `timed_mesh`."""
-    counts = _counts(lax.stop_gradient(osc), loop.codes, loop.entries, loop.durations)
+    counts = _counted_ends(lax.stop_gradient(osc), loop.codes, loop.entries, loop.durations)
     return power_of_two(math.ceil(min(float(jnp.max(counts)), 4096.0)) + 1, LEAST_STEPS)
 
 
 @jit
-def _counts(osc: Oscillator, codes: Array, entries: Array, durations: Array) -> Array:
+def _counted_ends(osc: Oscillator, codes: Array, entries: Array, durations: Array) -> Array:
     """The numbers of steps that arcs need, by the mean density of steps along them."""
 
     def one(codes, y, duration):
@@ -140,7 +140,7 @@ def timed_chain(osc: Oscillator, loop: Loop, size: int, turns: int) -> tuple[Tim
 # --- equations ------------------------------------------------------------------------------------
 
 
-def _arc_equations(turns: int, osc: Oscillator, codes, end, mesh, unknown: Array) -> Array:
+def _timed_arc_equations(turns: int, osc: Oscillator, codes, end, mesh, unknown: Array) -> Array:
     """(x1, x2, t, guard) at the end of one arc, from its unknowns (x1, x2, t, T).
 
     An unused arc ends as it begins, and its guard is its duration.
@@ -158,11 +158,13 @@ def _arc_equations(turns: int, osc: Oscillator, codes, end, mesh, unknown: Array
 
 
 def _and_columns(turns: int, osc, along, codes, end, mesh, unknown: Array):
-    """`_arc_equations` and their derivatives by the unknowns and along directions, [4, 4 + k]."""
-    return _columns(functools.partial(_arc_equations, turns), osc, along, codes, end, mesh, unknown)
+    """`_timed_arc_equations` and their derivatives by the unknowns and along directions, [4, 4 + k]."""
+    return _timed_columns(
+        functools.partial(_timed_arc_equations, turns), osc, along, codes, end, mesh, unknown
+    )
 
 
-def _columns(function: Callable, osc: Oscillator, along: Oscillator | None, *row: Array):
+def _timed_columns(function: Callable, osc: Oscillator, along: Oscillator | None, *row: Array):
     """A function of an oscillator and the row of an arc, and its derivatives by the unknowns, the
     last of the row, and along directions, in a last axis of 4 + k."""
     *given, unknown = row
@@ -188,28 +190,28 @@ def _by_turns(function: Callable) -> Callable[[int], Callable]:
     return of_turns
 
 
-_equations = _by_turns(_arc_equations)
-_equations_and_blocks = _by_turns(_and_columns)
+_timed_equations = _by_turns(_timed_arc_equations)
+_timed_equations_and_blocks = _by_turns(_and_columns)
 
 
-def _rows(chain: TimedChain, z: Array) -> tuple[Array, ...]:
+def _timed_rows(chain: TimedChain, z: Array) -> tuple[Array, ...]:
     return chain.codes, chain.ends, chain.mesh, z
 
 
-def _mismatch(out: Array, z: Array) -> Array:
+def _timed_mismatch(out: Array, z: Array) -> Array:
     exits = out[:, :3] - jnp.roll(z[:, :3], -1, axis=0)
     return jnp.concatenate([exits, out[:, 3:4]], axis=1)
 
 
 def timed_residual(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
     """The 4N equations at the unknowns z, [N, 4]: mismatch of x1, x2, t, and the guard."""
-    return _mismatch(_equations(chain.turns)((osc,), _rows(chain, z)), z)
+    return _timed_mismatch(_timed_equations(chain.turns)((osc,), _timed_rows(chain, z)), z)
 
 
 def timed_blocks(osc: Oscillator, along: Oscillator | None, chain: TimedChain, z: Array):
     """`timed_residual`, and its derivatives as `shooting.residual_and_blocks` has them."""
-    out, blocks = _equations_and_blocks(chain.turns)((osc, along), _rows(chain, z))
-    return _mismatch(out, z), blocks
+    out, blocks = _timed_equations_and_blocks(chain.turns)((osc, along), _timed_rows(chain, z))
+    return _timed_mismatch(out, z), blocks
 
 
 class TimedClosed(Equations):
@@ -227,7 +229,7 @@ class TimedClosed(Equations):
     def moved(self, given: Oscillator, z: Array, tangents: Oscillator) -> tuple[Array, Array]:
         along, weights = directions_of(given, tangents)
         _, blocks = timed_blocks(given, along, self.chain, z)
-        change = _mismatch(blocks[..., 4:] @ weights, jnp.zeros_like(z))
+        change = _timed_mismatch(blocks[..., 4:] @ weights, jnp.zeros_like(z))
         return change.reshape(-1), jacobian(blocks[..., :4])
 
 
@@ -257,12 +259,12 @@ _arc_maps = _by_turns(_arc_map)
 @_by_turns
 def _maps_and_slopes(turns, osc, along, *row):
     """`_arc_map` and its derivatives by the unknowns and along directions, [3, 3, 4 + k]."""
-    return _columns(functools.partial(_arc_map, turns), osc, along, *row)
+    return _timed_columns(functools.partial(_arc_map, turns), osc, along, *row)
 
 
 def arc_maps(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
     """`_arc_map` of all arcs, [N, 3, 3]."""
-    return _arc_maps(chain.turns)((osc,), _rows(chain, z))
+    return _arc_maps(chain.turns)((osc,), _timed_rows(chain, z))
 
 
 def _product(maps: Array) -> Array:
@@ -294,7 +296,7 @@ def monodromy_and_slopes(
     osc: Oscillator, along: Oscillator, chain: TimedChain, z: Array
 ) -> tuple[Array, Array, Array]:
     """`monodromy`, and its derivatives by z, [2, 2, N, 4], and along directions, [2, 2, k]."""
-    maps, slopes = _maps_and_slopes(chain.turns)((osc, along), _rows(chain, z))
+    maps, slopes = _maps_and_slopes(chain.turns)((osc, along), _timed_rows(chain, z))
 
     def times(total, one):
         return one @ total, total
@@ -422,9 +424,9 @@ def timed_admissible(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
         held = mode_of(jnp.where(flips, 0.0, after))
         needed = jnp.abs(mode_acceleration(now, held, end_state[0], end_state[1]))
         crosses = (end < n) & ~jnp.any(after == 0) & jnp.any(flips)
-        would_stick = crosses & (needed < capacity(now, held) - TOUCHES)
+        would_stick = crosses & (needed < capacity(now, held) - TOUCHES_AGAIN)
         least = least_guard(osc, codes, mesh, y, duration)
-        return (duration >= -HOLDS) & (least >= -TOUCHES) & ~would_stick
+        return (duration >= -HOLDS) & (least >= -TOUCHES_AGAIN) & ~would_stick
 
     columns = chain.codes, chain.mesh, chain.ends, following_codes(chain), z
     each = arc_by_arc(one)((osc,), columns)

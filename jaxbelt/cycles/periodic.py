@@ -155,7 +155,7 @@ class PeriodicMotion(eqx.Module):
 
     def sample(self, n: int) -> Array:
         """States (x1, x2) at n times evenly spread over its period, ends included, [n, 2]."""
-        return _sampled(self.oscillator, self.chain, self.unknowns, as_whole(n, "n"))
+        return _sampled_motion(self.oscillator, self.chain, self.unknowns, as_whole(n, "n"))
 
     def at(self, osc: Oscillator) -> "PeriodicMotion":
         """The motion with the same signature of another oscillator, near to its own.
@@ -173,7 +173,7 @@ class PeriodicMotion(eqx.Module):
         z = self.unknowns
         if own is not osc:
             z = jnp.concatenate([own.units.into(z[..., :2]), z[..., 2:]], axis=-1)
-        found, _ = _polished(own, self.chain, lax.stop_gradient(z))
+        found, _ = _polished_motion(own, self.chain, lax.stop_gradient(z))
         return in_given_units(found, osc, own)
 
     def row(self) -> dict[str, Any]:
@@ -229,7 +229,7 @@ class PeriodicMotion(eqx.Module):
 
 
 @jit
-def _sampled(osc: Oscillator, chain: TimedChain, z: Array, n: int) -> Array:
+def _sampled_motion(osc: Oscillator, chain: TimedChain, z: Array, n: int) -> Array:
     ends = jnp.cumsum(z[:, 3])
 
     def at(t):
@@ -346,7 +346,9 @@ def after_period(osc: Oscillator, followed: Followed) -> np.ndarray:
 
 
 @jit
-def _polished(osc: Oscillator, chain: TimedChain, guess: Array) -> tuple[PeriodicMotion, Array]:
+def _polished_motion(
+    osc: Oscillator, chain: TimedChain, guess: Array
+) -> tuple[PeriodicMotion, Array]:
     """The motion near a guess of a chain's unknowns, and the error that its steps leave."""
     solved = solve_timed(osc, chain, guess)
     z, settled = solved.z, solved.unsettled
@@ -382,26 +384,26 @@ def _motion(osc, chain, z, residual, iterations, status) -> PeriodicMotion:
 
 
 @jit
-def _with_derivatives(osc: Oscillator, motion: PeriodicMotion) -> PeriodicMotion:
+def _motion_with_derivatives(osc: Oscillator, motion: PeriodicMotion) -> PeriodicMotion:
     """A motion that is known, as one of an oscillator by which it can be differentiated."""
     chain, status = motion.chain, motion.status
     z = timed_solution(osc, chain, motion.unknowns)
     return _motion(osc, chain, z, motion.residual, motion.iterations, status)
 
 
-_chain_of = jit(timed_chain)
+_timed_chain_of = jit(timed_chain)
 
 
 def solved_from(osc: Oscillator, loop: Loop, turns: int) -> PeriodicMotion:
     """The motion that a loop nearly is, with as many steps of integration as it takes."""
-    chain, guess = _chain_of(osc, loop, least_steps(osc, loop), turns)
-    motion, error = _polished(osc, chain, guess)
+    chain, guess = _timed_chain_of(osc, loop, least_steps(osc, loop), turns)
+    motion, error = _polished_motion(osc, chain, guess)
     for _ in range(HALVINGS):
         converged = int(motion.status) in (Status.OK, Status.NOT_ADMISSIBLE)
         if not converged or float(error) < EXACT:
             break
         chain = replace(chain, mesh=jnp.repeat(0.5 * chain.mesh, 2, axis=1))
-        finer, remaining = _polished(osc, chain, guess)
+        finer, remaining = _polished_motion(osc, chain, guess)
         if float(remaining) > 0.1 * float(error):
             break  # the rest is rounding
         motion, error = finer, remaining
@@ -447,15 +449,15 @@ def _newton_step(osc: Oscillator, followed: Followed, turns: int) -> np.ndarray:
     """How far the state at the phase 0 is from that of a periodic motion, by Newton's method along
     the orbit as it was followed."""
     loop = followed.loop()
-    chain, z = _chain_of(osc, loop, least_steps(osc, loop), turns)
-    matrix = np.asarray(_monodromy(osc, chain, z))
+    chain, z = _timed_chain_of(osc, loop, least_steps(osc, loop), turns)
+    matrix = np.asarray(_monodromy_of(osc, chain, z))
     miss = followed.starts[-1] - followed.starts[0]
     if not np.all(np.isfinite(matrix)):
         return np.full(2, np.nan)
     return np.linalg.lstsq(np.eye(2) - matrix, miss, rcond=None)[0]
 
 
-_monodromy = jit(monodromy)
+_monodromy_of = jit(monodromy)
 
 
 def _of_least_periods(osc: Oscillator, motion: PeriodicMotion, turns: int) -> PeriodicMotion:
@@ -501,10 +503,12 @@ def periodic(osc: Oscillator, guess: ArrayLike | tuple, *, periods: int = 1) -> 
     check_finite(guess, "guess")
     periods = as_whole(periods, "periods")
     require(periods <= PERIODS_AT_ONCE, "periods", f"at most {PERIODS_AT_ONCE}", periods)
-    return _differentiable(osc, guess, lambda o, y, turns: periodic_from(o, y, periods, turns))
+    return _differentiable_motion(
+        osc, guess, lambda o, y, turns: periodic_from(o, y, periods, turns)
+    )
 
 
-def _differentiable(osc: Oscillator, y: Array, find: Any) -> PeriodicMotion:
+def _differentiable_motion(osc: Oscillator, y: Array, find: Any) -> PeriodicMotion:
     """What find(osc, y, turns) finds of the known oscillator in own units, as a function of osc."""
     still, y = lax.stop_gradient((osc, y))
     expected = "known: under jit and vmap use motion.at(osc) of a motion that was found outside"
@@ -515,7 +519,7 @@ def _differentiable(osc: Oscillator, y: Array, find: Any) -> PeriodicMotion:
     if is_concrete(osc):
         return in_given_units(motion, osc, own)
     own = in_own_units(osc)
-    return in_given_units(_with_derivatives(own, motion), osc, own)
+    return in_given_units(_motion_with_derivatives(own, motion), osc, own)
 
 
 def attracted(osc: Oscillator, y0: Any, turns: int) -> PeriodicMotion:
@@ -560,7 +564,7 @@ def _repeated(
 
 def motion_reached(osc: Oscillator, y0: Array) -> PeriodicMotion:
     """What `find_cycle` returns of an oscillator with a clock."""
-    return _differentiable(osc, y0, attracted)
+    return _differentiable_motion(osc, y0, attracted)
 
 
 def motions_of(osc: Oscillator, starts: Sequence[Any], turns: int) -> list[PeriodicMotion]:
@@ -568,12 +572,14 @@ def motions_of(osc: Oscillator, starts: Sequence[Any], turns: int) -> list[Perio
     found: list[PeriodicMotion] = []
     for start in starts:
         motion = attracted(osc, start, turns)
-        if int(motion.status) == Status.OK and not any(is_same(motion, one) for one in found):
+        if int(motion.status) == Status.OK and not any(
+            is_same_motion(motion, one) for one in found
+        ):
             found.append(motion)
     return found
 
 
-def is_same(one: PeriodicMotion, other: PeriodicMotion) -> bool:
+def is_same_motion(one: PeriodicMotion, other: PeriodicMotion) -> bool:
     """Whether two motions are one, wherever they begin."""
     if one.periods != other.periods:
         return False

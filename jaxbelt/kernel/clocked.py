@@ -102,7 +102,7 @@ def needed_or_rate(osc: Oscillator, mode: Mode, t: Array, x1: Array, x2: Array) 
     return mode_acceleration(at_time(osc, t), mode, x1, x2)
 
 
-def lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, t0=0.0) -> Lanes:
+def timed_lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, t0=0.0) -> Lanes:
     """Lanes at the start of their runs, at the time t0, without what an observer adds."""
     zero = jnp.zeros_like(x1)
     t = zero + t0
@@ -139,7 +139,7 @@ def lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, t0=0.0) -> Lanes:
     )
 
 
-class Window(eqx.Module):
+class TimedWindow(eqx.Module):
     """What does not change until the next event, arrays [lanes].
 
     signs: of the mode; stuck, active: lanes that stick, that are to be stepped; longest: their
@@ -154,7 +154,7 @@ class Window(eqx.Module):
     numbers: tuple[Array, Array] | None
 
 
-def window_of(osc: Oscillator, lanes: Lanes, *, extrema: Array | None = None) -> Window:
+def timed_window_of(osc: Oscillator, lanes: Lanes, *, extrema: Array | None = None) -> TimedWindow:
     """The bounds of the current modes."""
     mode, n = lanes.mode, len(osc.belts)
     stuck = mode.any_stuck
@@ -180,7 +180,7 @@ def window_of(osc: Oscillator, lanes: Lanes, *, extrema: Array | None = None) ->
             numbers.append(first_of(hit, names, jnp.asarray(-1)))
             found.append(foremost(at_time(osc, lanes.t), hit, edges(osc), edge))
         found, numbers = tuple(found), tuple(numbers)
-    return Window(mode.signs, stuck, ~lanes.done, most, found, numbers)
+    return TimedWindow(mode.signs, stuck, ~lanes.done, most, found, numbers)
 
 
 class _Attempt(eqx.Module):
@@ -197,7 +197,9 @@ class _Attempt(eqx.Module):
     needed: list[Array]
 
 
-def _attempt(osc, clock: StepClock, window: Window, lanes: Lanes, rtol, atol, rates) -> _Attempt:
+def _timed_attempt(
+    osc, clock: StepClock, window: TimedWindow, lanes: Lanes, rtol, atol, rates
+) -> _Attempt:
     """One Runge-Kutta step of all lanes that slip; those that stick follow their belt."""
     own, h, ones, mode, stuck = nystroem(), clock.h, clock.ones, lanes.mode, window.stuck
     x1, x2, stages = lanes.x1, lanes.x2, [lanes.a]
@@ -210,7 +212,7 @@ def _attempt(osc, clock: StepClock, window: Window, lanes: Lanes, rtol, atol, ra
         signs = window.signs
         pulls = tuple(belt.load * sign for belt, sign in zip(now.belts, signs, strict=True))
         a = as_quotient(now, signs, pulls, ones, x1, x2)
-        return a - _stick_rate(now, mode) if _moves(now) else a
+        return a - _rate_of_stick(now, mode) if _moves(now) else a
 
     slopes = [rates(osc, mode, lanes.t, x1, x2)] if rates else []
     for row, row1, c in zip(own.a[1:-1], own.aa[1:-1], own.c[1:-1].tolist(), strict=True):
@@ -230,17 +232,19 @@ def _attempt(osc, clock: StepClock, window: Window, lanes: Lanes, rtol, atol, ra
     error = jnp.where(stuck, jnp.where(jnp.isfinite(stages[-1]), 0.0, jnp.inf), error)
     integrals = jax.tree.map(lambda i, *s: i + h * combine(own.a[-1], s), lanes.integrals, *slopes)
     end = clock.at(1.0)
-    rate = jnp.where(stuck, _stick_rate(end, mode), stages[-1])
+    rate = jnp.where(stuck, _rate_of_stick(end, mode), stages[-1])
     needed = [stages[i] for i in (0, *STAGES)]
     return _Attempt(h, y1, y2, stages[-1], rate, lax.stop_gradient(error), integrals, needed)
 
 
-def flown(osc, window: Window, ones: Array, lanes: Lanes, h: Array, x1: Array, x2: Array):
+def timed_flown(
+    osc, window: TimedWindow, ones: Array, lanes: Lanes, h: Array, x1: Array, x2: Array
+):
     """The states (x1, x2) that a step of size h leads to from those of the arguments."""
     a = needed_or_rate(osc, lanes.mode, lanes.t, x1, x2)
     lanes = replace(lanes, x1=x1, x2=x2, a=a)
     clock = StepClock.of(osc, ones, lanes.t, h)
-    new = _attempt(osc, clock, window, lanes, jnp.ones(()), jnp.ones(()), None)
+    new = _timed_attempt(osc, clock, window, lanes, jnp.ones(()), jnp.ones(()), None)
     return new.x1, new.x2
 
 
@@ -248,7 +252,7 @@ def _moves(now: Oscillator) -> bool:
     return any(hasattr(belt, "rate") for belt in now.belts)
 
 
-def _stick_rate(now: Oscillator, mode: Mode) -> Array:
+def _rate_of_stick(now: Oscillator, mode: Mode) -> Array:
     """The acceleration of the belts that are stuck to, over omega; 0 where none is."""
     zero = jnp.zeros_like(mode.codes[0])
     if not _moves(now):
@@ -302,14 +306,14 @@ def _quartic(start, end, change, h) -> list[Array]:
     return [f0, m0, c2 + k4, c3 - 2 * k4, k4]
 
 
-def _meetings(osc, clock: StepClock, window: Window, lanes: Lanes, new: _Attempt, rtol, atol):
+def _meetings(osc, clock: StepClock, window: TimedWindow, lanes: Lanes, new: _Attempt, rtol, atol):
     """What the step has to do with each guard of its mode."""
     h, n, ones = clock.h, len(osc.belts), clock.ones
     reach = LANDING * jnp.sqrt(rtol)
     room = LANDS_WITHIN * (atol + rtol * jnp.abs(new.x2)) * h
     start = clock.at(0.0)
     stuck, mode = window.stuck, lanes.mode
-    rate0 = jnp.where(stuck, _stick_rate(start, mode), lanes.a)
+    rate0 = jnp.where(stuck, _rate_of_stick(start, mode), lanes.a)
     own = _quartic((lanes.x2, rate0), (new.x2, new.rate), new.x1 - lanes.x1, h)
     own = [materialise(k, ones) for k in own]
     found, fuzz = [], ROUNDING * blur(lanes.t)
@@ -354,7 +358,7 @@ def _meetings(osc, clock: StepClock, window: Window, lanes: Lanes, new: _Attempt
     no = none > 0
     limit = where_any(
         stuck,
-        lambda: _limit(osc, clock, window, lanes, new, room, reach),
+        lambda: _limit_of_stick(osc, clock, window, lanes, new, room, reach),
         _Meeting(no, no, none + 1, none + NEVER, jnp.full_like(lanes.hit, 3 * n)),
     )
     asked = stuck & (lanes.status != Status.STUCK_FOREVER.value)
@@ -363,7 +367,7 @@ def _meetings(osc, clock: StepClock, window: Window, lanes: Lanes, new: _Attempt
     return found
 
 
-def _limit(osc, clock: StepClock, window, lanes, new: _Attempt, room, reach) -> _Meeting:
+def _limit_of_stick(osc, clock: StepClock, window, lanes, new: _Attempt, room, reach) -> _Meeting:
     """The meeting with a limit of what stuck belts can hold, capacity -+ needed: the nearer one.
 
     Where it may meet both the step is cut.
@@ -408,9 +412,9 @@ def _limit(osc, clock: StepClock, window, lanes, new: _Attempt, room, reach) -> 
     return replace(one, delta=back)
 
 
-def take_step(
+def take_timed_step(
     osc,
-    window: Window,
+    window: TimedWindow,
     ones: Array,
     lanes: Lanes,
     t1,
@@ -426,7 +430,7 @@ def take_step(
     going = window.active & (lanes.h > 0) & (remaining > 0)
     h = jnp.where(going, jnp.minimum(jnp.minimum(lanes.h, window.longest), remaining), 0.0)
     clock = StepClock.of(osc, ones, lanes.t, h)
-    new = _attempt(osc, clock, window, lanes, rtol, atol, rates)
+    new = _timed_attempt(osc, clock, window, lanes, rtol, atol, rates)
     found = _meetings(osc, clock, window, lanes, new, rtol, atol)
     delta = functools.reduce(jnp.minimum, [one.delta for one in found])
     number = first_of(
@@ -469,11 +473,11 @@ def take_step(
         h=lax.stop_gradient(jnp.where(going, proposed, lanes.h)),
         pace=lax.stop_gradient(jnp.where(accepted & ~window.stuck, pace, lanes.pace)),
         hit=jnp.where(lands | stands, number, lanes.hit).astype(lanes.hit.dtype),
-        integrals=_integrated(rates, osc, lanes, new, delta, x1, x2, kept) if rates else None,
+        integrals=_timed_integrated(rates, osc, lanes, new, delta, x1, x2, kept) if rates else None,
     )
 
 
-def _integrated(rates, osc, lanes: Lanes, new: _Attempt, delta, x1, x2, kept) -> Any:
+def _timed_integrated(rates, osc, lanes: Lanes, new: _Attempt, delta, x1, x2, kept) -> Any:
     """The integrals after a step and the Taylor step behind it."""
     t = lanes.t + new.h
     ends = [(t, new.x1, new.x2), (t + delta, x1, x2)]
@@ -482,7 +486,7 @@ def _integrated(rates, osc, lanes: Lanes, new: _Attempt, delta, x1, x2, kept) ->
     return choose(kept, totals, lanes.integrals)
 
 
-def pass_events(
+def pass_timed_events(
     osc: Oscillator, lanes: Lanes, t1: Array, rtol: Array, *, captures: bool, derivatives: bool
 ) -> tuple[Lanes, Passage]:
     """Lanes that stand on a guard go on, see `events.pass_events`."""

@@ -160,8 +160,8 @@ class StepClock(NamedTuple):
             pushes.append(materialise(force.on_mass(time, self.osc.damping), self.ones))
         rows = zip(self.osc.belts, self.velocities, self.loads, strict=True)
         belts = tuple(_belt(belt, v, load, c) for belt, v, load in rows)
-        forcing = tuple(_unchecked(ConstantForce, amplitude=push) for push in pushes)
-        return _unchecked(Oscillator, **vars(self.osc) | dict(belts=belts, forcing=forcing))
+        forcing = tuple(_wave_unchecked(ConstantForce, amplitude=push) for push in pushes)
+        return _wave_unchecked(Oscillator, **vars(self.osc) | dict(belts=belts, forcing=forcing))
 
     def carried(self, mode: Mode, x1: Array, c: float) -> tuple[Array, Array]:
         """The state (x1, x2) at the part c of the step of a mass that sticks."""
@@ -186,10 +186,10 @@ def _belt(belt: Belt, velocity: Any, load: Any, c: float) -> Belt:
     fields = vars(belt) | dict(velocity=velocity.at(c), load=load.at(c))
     if moves:
         fields["rate"] = velocity.rate(c)
-    return _unchecked(MovingBelt if moves else Belt, **fields)
+    return _wave_unchecked(MovingBelt if moves else Belt, **fields)
 
 
-def _unchecked(kind: type, /, **fields: Any) -> Any:
+def _wave_unchecked(kind: type, /, **fields: Any) -> Any:
     made = object.__new__(kind)
     for name, value in fields.items():
         if name != "units":

@@ -100,7 +100,7 @@ def passage(points: Sequence[Array], doubt: Array, rounding: Array, trust: Array
     root = _first_passage(points, -rounding)
     dips = known & ~below & dip & ~peak & ~stays
     guess = jnp.where(dips, _first_passage([-d for d in steps], rounding), root)
-    theta, lowest = _newton(points, guess, dips)
+    theta, lowest = _newton_step(points, guess, dips)
     passes = dips & (lowest < -jnp.maximum(doubt, rounding))
     inside = jnp.minimum(theta, 1 - theta) > 1e-3
     splits = dips & ~passes & (lowest <= doubt + rounding) & inside & ~trust
@@ -122,7 +122,7 @@ def _first_passage(points: Sequence[Array], level: Array) -> Array:
     return jnp.where(points[0] < level, 0.0, found)
 
 
-def _newton(points: Sequence[Array], theta: Array, extreme: Array) -> tuple[Array, Array]:
+def _newton_step(points: Sequence[Array], theta: Array, extreme: Array) -> tuple[Array, Array]:
     """The root near theta, in [0, 1], or the extremum, and the value there."""
     for _ in range(NEWTON_STEPS):
         value, slope, bend = value_at(points, theta)

@@ -122,7 +122,7 @@ class Along(Observer):
     def start(self, osc, lanes):
         sides = []
         for _, _, function in self._sections():
-            value, rate = _told(function, osc, lanes, lanes.x1, lanes.x2)
+            value, rate = _seen(function, osc, lanes, lanes.x1, lanes.x2)
             sides.append(side_of(value, rate, jnp.ones_like(value)))
         passed = tuple(one.passed_at(osc, lanes.t, lanes.events) for _, one in self._times())
         state = as_given(self.reducer.init, osc, lanes.x1, lanes.x2)
@@ -166,7 +166,7 @@ class Along(Observer):
         seen, sides = new.memory, []
         parts = zip(self._sections(), seen.sides, cuts, strict=True)
         for (number, direction, function), side, cut in parts:
-            now = _told(function, osc, new, new.x1, new.x2)
+            now = _seen(function, osc, new, new.x1, new.x2)
             now = jnp.where(kept, side_of(*now, side), side)
             # The nearer end; from there a Taylor step leads to the crossing.
             near = choose(cut.at_start, lanes, new)
@@ -228,7 +228,7 @@ class Along(Observer):
         sides = []
         for (number, direction, function), side in zip(self._sections(), seen.sides, strict=True):
             # Where the field jumps, its extrema jump, too.
-            value = _told(function, osc, lanes, lanes.x1, lanes.x2)
+            value = _seen(function, osc, lanes, lanes.x1, lanes.x2)
             now = jnp.where(busy & ~lanes.done, side_of(*value, side), side)
             wanted = (now != side) & (now * direction >= 0)
             seen = self._ask(seen, osc, lanes, jnp.zeros_like(lanes.t), wanted, number)
@@ -347,7 +347,7 @@ def _field(osc: OwnOscillator, mode: Mode, t: Array, x1: Array, x2: Array) -> Ar
     return field_at(osc, mode, (x1, x2, t))[1]
 
 
-def _told(function, osc: OwnOscillator, lanes: Lanes, x1: Array, x2: Array):
+def _seen(function, osc: OwnOscillator, lanes: Lanes, x1: Array, x2: Array):
     """A section's value and rate at a state of lanes."""
     if not has_clock(osc):
         return value_and_rate(function, osc, lanes.mode, x1, x2)
@@ -380,7 +380,7 @@ def _to_section(function, osc, lanes: Lanes, delta, low, high) -> Array:
     """
     delta = lax.stop_gradient(delta)
     later = replace(lanes, t=lanes.t + delta) if has_clock(osc) else lanes
-    value, rate = _told(function, osc, later, *_moved(osc, lanes, delta))
+    value, rate = _seen(function, osc, later, *_moved(osc, lanes, delta))
     step = -value / lax.stop_gradient(jnp.where(rate == 0, 1.0, rate))
     step = jnp.where(rate == 0, 0.0, step)
     return lax.stop_gradient(jnp.clip(delta + step, low, high) - step) + step

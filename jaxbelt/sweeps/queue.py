@@ -63,7 +63,7 @@ def _oscillators(program: Program, shared, rows: tuple[Array, ...]) -> OwnOscill
 def _moves_of(osc: OwnOscillator) -> tuple[Callable, Callable, Callable]:
     """How lanes go on: `pass_events`, `window_of` and `take_step`, with a clock or without."""
     if has_clock(osc):
-        return clocked.pass_events, clocked.window_of, clocked.take_step
+        return clocked.pass_timed_events, clocked.timed_window_of, clocked.take_timed_step
     return events.pass_events, step.window_of, step.take_step
 
 
@@ -71,7 +71,7 @@ def _begin(program: Program, osc, run, x1, x2, passes, rtol, t0=None) -> Lanes:
     """Lanes at the start of their runs."""
     x1, x2 = x1 / osc.units.length, x2 / osc.units.length
     if has_clock(osc):
-        lanes = clocked.lanes_at_start(osc, run, x1, x2, passes, rtol, t0)
+        lanes = clocked.timed_lanes_at_start(osc, run, x1, x2, passes, rtol, t0)
     else:
         if program.derivatives:
             x1, x2 = start_at_focus(osc, x1, x2)

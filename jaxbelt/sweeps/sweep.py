@@ -31,7 +31,6 @@ from .along import Along
 from .audit import chosen, differing
 from .clusters import check_executor, do_on_cluster
 from .datasets import Memory
-from .exponents import Exponents
 from .observers import Reduce
 from .progress import SweepProgress
 from .question import Question
@@ -134,7 +133,7 @@ def sweep(
         audit = float(as_array(audit, "audit"))
         require(0 <= audit <= 1, "audit", "a share from 0 to 1", audit)
         require(
-            audit == 0 or not isinstance(question.program.observer, Reduce | Along | Exponents),
+            audit == 0 or not isinstance(question.program.observer, Reduce | Along),
             "audit",
             '0 but for observe="final" and "attractor"',
             audit,
