@@ -376,9 +376,9 @@ def _is_apart(point: BifurcationPoint, other: BifurcationPoint) -> bool:
 def _is_another(point: BifurcationPoint, other: BifurcationPoint) -> bool:
     """Whether two points at one value are of two cycles, or of two equilibria."""
     if all(int(one.cycle.status) == Status.OK for one in (point, other)):
-        return distance(place_of(point.cycle), place_of(other.cycle)) >= SAME_CYCLE
+        return bool(distance(place_of(point.cycle), place_of(other.cycle)) >= SAME_CYCLE)
     places = ([float(one.x1), 0.0] for one in (point, other))
-    return distance(*places, least=1.0) > SAME_CYCLE
+    return bool(distance(*places, least=1.0) > SAME_CYCLE)
 
 
 def _first_found(

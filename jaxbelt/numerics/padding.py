@@ -33,9 +33,9 @@ def longer(tree: Any, size: int, *, axis: int = 0, fill: int | float | None = No
 
 def in_groups_of(size: int, tree: Any, *, fill: int | float | None = None) -> Any:
     """The rows of a tree of arrays in groups, [groups, size, ..], the last one made `longer`."""
-    return jax.tree.map(
-        lambda leaf: longer(leaf, -(-len(leaf) // size) * size, fill=fill).reshape(
-            -1, size, *leaf.shape[1:]
-        ),
-        tree,
-    )
+
+    def one(leaf: Array) -> Array:
+        groups = -(-len(leaf) // size)
+        return longer(leaf, groups * size, fill=fill).reshape(groups, size, *leaf.shape[1:])
+
+    return jax.tree.map(one, tree)
