@@ -131,10 +131,17 @@ def check_number(name: str, value: float) -> None:
 LOOSEST = 1e-2
 
 
-def check_tolerance(value: float) -> None:
-    """Raise unless it is one that an integrator can be asked for."""
+def tolerances(value: float | None) -> dict[str, float]:
+    """The arguments rtol and atol for the option `--tolerance`; none, where it is not given.
+
+    Raises:
+        ValueError: If an integrator cannot be asked for it.
+    """
+    if value is None:
+        return {}
     if not 0 < value <= LOOSEST:
         raise ValueError(f"tolerance must be > 0 and at most {LOOSEST}, got {value}")
+    return {"rtol": value, "atol": value}
 
 
 def check_range(name: str, ends: tuple[float, float]) -> None:

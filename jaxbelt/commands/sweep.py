@@ -19,11 +19,11 @@ from .options import (
     check_axis_names,
     check_number,
     check_out,
-    check_tolerance,
     family,
     make_console,
     plain_errors,
     say,
+    tolerances,
     turn_on_float64,
 )
 
@@ -75,8 +75,12 @@ def sweep(
         ),
     ] = None,
     tolerance: Annotated[
-        float, typer.Option(help="Relative and absolute tolerance of the integrator.")
-    ] = 1e-8,
+        float | None,
+        typer.Option(
+            help="Relative and absolute tolerance of the integrator.",
+            show_default="1e-8, the absolute one of the oscillator's own size",
+        ),
+    ] = None,
     out: Annotated[
         Path,
         typer.Option(
@@ -136,7 +140,7 @@ def sweep(
         shown = variable or VARIABLES[observe][0]
         drawn = part is None and sum(len(axis) > 1 for axis in values.values()) in (1, 2)
         _check_variable(shown, observe)
-        check_tolerance(tolerance)
+        asked: dict[str, Any] = dict(y0=start, observe=observe, **tolerances(tolerance))
         if t1 is not None:
             check_number("t1", t1)
         if out.suffix == ".nc":
@@ -147,13 +151,7 @@ def sweep(
         make = family(system, {}, belt, damping, omega, own)
         if t1 is None and observe != "attractor":
             t1 = 100.0
-        asked: dict[str, Any] = dict(
-            y0=start,
-            t1=t1,
-            rtol=tolerance,
-            atol=None if tolerance == 1e-8 else tolerance,
-            observe=observe,
-        )
+        asked["t1"] = t1
         if dry_run:
             told = jb.explain(make, values, **asked)
             say(console, [repr(told)], [], as_json=as_json, data=asdict(told))
