@@ -18,7 +18,7 @@ import jaxbelt as jb
 from jaxbelt import paper as reproduce
 from jaxbelt.cli import app
 from jaxbelt.commands.map import write_table
-from jaxbelt.commands.options import Description, parse_belt
+from jaxbelt.commands.options import Description, parse_belt, tolerances
 from jaxbelt.commands.sweep import VARIABLES
 from jaxbelt.model.parameters import names_of
 from jaxbelt.sweeps.question import Question
@@ -108,6 +108,13 @@ OWN = ("0.3,law=coulomb,static=0.8,kinetic=0.5", "-0.1,steepness=8,load=0.5,lowe
 def own(nu0, load, damping=0.4):
     second = jb.Belt(-0.1, jb.Conti(1.0, 0.6, 8.0), load, lower=0.2)
     return jb.Oscillator(damping, (jb.Belt(nu0, jb.Coulomb(0.8, 0.5)), second), omega=1.1)
+
+
+@pytest.mark.parametrize("given", [1e-10, 1e-8, 1e-3])
+def test_a_tolerance_that_is_given_is_a_length_in_the_users_unit(given):
+    """Also where it is the number of the default, which follows the oscillator's own size."""
+    assert tolerances(given) == {"rtol": given, "atol": given}
+    assert tolerances(None) == {}
 
 
 @pytest.mark.parametrize("system", ["a", "b", "c", "d", OWN])

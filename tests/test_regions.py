@@ -13,18 +13,13 @@ from jaxbelt.bifurcations.bounds import Bounds, _without_known, neighbours_that_
 from jaxbelt.bifurcations.cells import motions_in_cells, region_name
 from jaxbelt.bifurcations.labels import Label
 from jaxbelt.bifurcations.regions import varied_by_names
-from jaxbelt.model.own_units import in_own_units
 from jaxbelt.numerics.continuation import Stop
 from tests.campaign import engine
 from tests.campaign.cases import PAPER
+from tests.campaign.maps import in_one_unit
 
 NUS = ("nu0", "nu1")
 class_c, class_d = jb.presets.class_c, jb.presets.class_d
-
-
-def own(make):
-    """Oscillators as a map takes them: in own units, with one length for all."""
-    return lambda **values: in_own_units(make(**values), 1.0)
 
 
 def letters_seen_by_engine(osc):
@@ -43,7 +38,7 @@ def test_cells_have_the_attractors_that_an_engine_finds_from_a_grid_of_starts():
     """Three cycles at once, three fixed points, a cycle around a pseudo-focus among them."""
     points = np.array([(-0.05, 0.1), (-0.5, 0.6), (0.2, -0.25), (-0.22, 0.23), (0.3, -0.65)])
     make = functools.partial(class_d, sigma0=-0.3, sigma1=0.3)
-    names = motions_in_cells(own(make), NUS, points).names.tolist()
+    names = motions_in_cells(in_one_unit(make), NUS, points).names.tolist()
     assert names[:2] == ["3abc:(f)(f)(f)", "1:fff"]
     for (nu0, nu1), name in zip(points.tolist(), names, strict=True):
         belts = (
@@ -84,7 +79,7 @@ def test_curves_are_found_where_no_line_meets_them(corner_of_map):
     bounds.search_lines(1)
     grid = np.meshgrid(*told.values, indexing="ij")
     cells = motions_in_cells(
-        own(make), told.names, np.column_stack([axis.ravel() for axis in grid])
+        in_one_unit(make), told.names, np.column_stack([axis.ravel() for axis in grid])
     )
     pairs = neighbours_that_differ(cells.motions.reshape(grid[0].shape), told.on_line)
     missing = int(np.sum(bounds.away(pairs) > 0.5))

@@ -141,10 +141,17 @@ def check_number(name: str, value: float) -> None:
 LOOSEST = 1e-2
 
 
-def check_tolerance(value: float) -> None:
-    """Raises unless the value is a possible tolerance of an integrator."""
+def tolerances(value: float | None) -> dict[str, float]:
+    """The arguments rtol and atol for the option `--tolerance`; none, where it is not given.
+
+    Raises:
+        ValueError: If an integrator cannot be asked for it.
+    """
+    if value is None:
+        return {}
     if not 0 < value <= LOOSEST:
         raise ValueError(f"tolerance must be > 0 and at most {LOOSEST}, got {value}")
+    return {"rtol": value, "atol": value}
 
 
 def check_range(name: str, ends: tuple[float, float]) -> None:
@@ -223,9 +230,6 @@ Json = Annotated[
 Interval = tuple[float, float]
 Start = Annotated[
     Interval, typer.Option(metavar="X1 X2", help="Displacement x1 and velocity x2 at tau = 0.")
-]
-Tolerance = Annotated[
-    float, typer.Option(help="Relative and absolute tolerance of the integrator.")
 ]
 Out = Annotated[
     Path,

@@ -15,15 +15,14 @@ from .options import (
     Json,
     Out,
     Start,
-    Tolerance,
     as_json_value,
     check_number,
-    check_tolerance,
     describes,
     make_console,
     outputs,
     plain_errors,
     say,
+    tolerances,
     turn_on_float64,
 )
 
@@ -46,7 +45,13 @@ def simulate(
     ] = "filippov",
     v_star: Annotated[float, typer.Option(help="Half-width of the switch model's band.")] = 1e-3,
     eps: Annotated[float, typer.Option(help="Width of the smooth model's tanh.")] = 1e-3,
-    tolerance: Tolerance = 1e-10,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(
+            help="Relative and absolute tolerance of the integrator.",
+            show_default="1e-10, the absolute one of the oscillator's own size",
+        ),
+    ] = None,
     out: Out = Path("trajectory"),
     as_json: Json = False,
 ) -> None:
@@ -91,7 +96,7 @@ def simulate(
             names = ", ".join(FORMULATIONS)
             raise ValueError(f"formulation must be one of {names}, got {formulation}{meant}")
         check_number("t1", t1)
-        check_tolerance(tolerance)
+        asked = tolerances(tolerance)
         if not all(map(math.isfinite, start)):
             raise ValueError(f"start must be finite, got {start[0]} {start[1]}")
         written = outputs(out, ".png", ".csv", "_events.csv")
@@ -105,8 +110,7 @@ def simulate(
             start,
             t1,
             ts=np.array([t1 * i / (samples - 1) for i in range(samples)]),
-            rtol=tolerance,
-            atol=None if tolerance == 1e-10 else tolerance,
+            **asked,
             formulation=formulation,
             v_star=v_star,
             eps=eps,

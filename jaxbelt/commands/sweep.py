@@ -14,14 +14,13 @@ from .options import (
     Description,
     Json,
     Start,
-    Tolerance,
     check_number,
     check_out,
-    check_tolerance,
     describes,
     make_console,
     plain_errors,
     say,
+    tolerances,
     turn_on_float64,
 )
 
@@ -66,7 +65,13 @@ def sweep(
             help="End of each run.", show_default="30000 for attractors, 100 for the final state"
         ),
     ] = None,
-    tolerance: Tolerance = 1e-8,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(
+            help="Relative and absolute tolerance of the integrator.",
+            show_default="1e-8, the absolute one of the oscillator's own size",
+        ),
+    ] = None,
     out: Annotated[
         Path,
         typer.Option(
@@ -126,7 +131,7 @@ def sweep(
         shown = variable or VARIABLES[observe][0]
         drawn = part is None and sum(len(axis) > 1 for axis in values.values()) in (1, 2)
         _check_variable(shown, observe)
-        check_tolerance(tolerance)
+        asked: dict[str, Any] = dict(y0=start, observe=observe, **tolerances(tolerance))
         if t1 is not None:
             check_number("t1", t1)
         if out.suffix == ".nc":
@@ -137,13 +142,7 @@ def sweep(
         make = described.along(own)
         if t1 is None and observe != "attractor":
             t1 = 100.0
-        asked: dict[str, Any] = dict(
-            y0=start,
-            t1=t1,
-            rtol=tolerance,
-            atol=None if tolerance == 1e-8 else tolerance,
-            observe=observe,
-        )
+        asked["t1"] = t1
         if dry_run:
             estimate = jb.explain(make, values, **asked)
             say(console, [repr(estimate)], [], as_json=as_json, data=asdict(estimate))

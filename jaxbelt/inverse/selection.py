@@ -116,8 +116,9 @@ def own_units_of(osc: Oscillator, names: Sequence[str]) -> np.ndarray:
     named, leaves, units = names_of(osc), jax.tree.leaves(osc), []
     for name in names:
         leaf = named.index(name.partition(" = ")[0])
-        own = Variation.of_leaves(osc, [leaf]).in_own_units(np.array([float(leaves[leaf])]))
-        units.append(float(own.own.parameters[0]))
+        variation = Variation.of_leaves(osc, [leaf])
+        known = variation.in_own_units(np.array([float(leaves[leaf])])).own
+        units.append(float(known.parameters[0]))
     return np.array(units)
 
 

@@ -406,20 +406,22 @@ class Variation:
 
     @property
     def own(self) -> "UnitsOfVariation":
-        """The units of what is computed in own ones."""
+        """The units of a variation that is in own units; `units` is None for any other."""
         assert self.units is not None
         return self.units
 
     def in_own_units(self, *rows: Any) -> "Variation":
         """The same oscillators in one unit of length, and the parameters in units of their own.
 
-        rows: values of the parameters, [k] each. The unit of length is the largest of the own ones
-        of the oscillators there, of several but the first; that of a parameter is by how much it
-        changes a number of the first of these by one, rounded down to a power of two.
+        rows: values of the parameters, [k] each; of several the first is where the parameters'
+        units are taken, the others are the ends of what is varied. The unit of length is the
+        largest own unit of the oscillators at these ends (or at the one row). The unit of a
+        parameter is the change of it that changes a number of the oscillator at the first row by
+        one, rounded down to a power of two.
         """
         if self.units is not None:
             return self
-        # Between the ends of a path there may be no possible oscillator.
+        # Not the first of several: between the ends there may be no possible oscillator.
         lengths = [own_length(self.oscillator(values)) for values in rows[1:] or rows]
         one: Any = np if is_concrete(lengths) else jnp
         return self.in_units(functools.reduce(one.maximum, lengths), rows[0])

@@ -93,16 +93,16 @@ def differences(plane: Plane, told: jb.RegionMap) -> tuple[Counter, list[str]]:
     return counts, wrong
 
 
-def _own(plane: Plane):
-    """The plane's oscillators as a map takes them: in own units, with one length for all."""
-    return lambda **values: in_own_units(plane.make(**values), 1.0)
+def in_one_unit(make: Callable[..., jb.Oscillator]) -> Callable[..., jb.Oscillator]:
+    """A function whose oscillators are in own units with one length for all, as `look_at` needs."""
+    return lambda **values: in_own_units(make(**values), 1.0)
 
 
 def _boundaries(plane: Plane, told: jb.RegionMap) -> np.ndarray:
     """Pairs of neighbouring cells that differ, as `bounds.neighbours_that_differ` has them."""
     grid = np.meshgrid(*told.values, indexing="ij")
     points = np.column_stack([axis.ravel() for axis in grid])
-    cells = motions_in_cells(_own(plane), told.names, points)
+    cells = motions_in_cells(in_one_unit(plane.make), told.names, points)
     return neighbours_that_differ(cells.motions.reshape(grid[0].shape), told.on_line)
 
 
@@ -122,7 +122,7 @@ def _bounds_something(plane: Plane, told: jb.RegionMap, curve: jb.BifurcationCur
         chord = (curve.values[min(row + 1, len(curve) - 1)] - curve.values[max(row - 1, 0)]) / sides
         normal = np.array([-chord[1], chord[0]]) / np.linalg.norm(chord)
         points += [curve.values[row] + side * BESIDE * normal * sides for side in (-1, 1)]
-    motions = motions_in_cells(_own(plane), told.names, np.array(points)).motions
+    motions = motions_in_cells(in_one_unit(plane.make), told.names, np.array(points)).motions
     return bool(
         np.any((motions[::2] != motions[1::2]) & (motions[::2] >= 0) & (motions[1::2] >= 0))
     )
