@@ -93,7 +93,7 @@ class CrossingSliding(AbstractStickCondition):
     line: ClassVar[Line] = Line("crossing-sliding", "#CC79A7", (0, (5, 1.5)))
 
     def with_clock(self):
-        return TimedCrossing(self.belt)
+        return TimedCrossing(int(self.belt))
 
     @property
     def room(self):

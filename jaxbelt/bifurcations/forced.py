@@ -113,7 +113,7 @@ class TimedSystem(AbstractSystem):
         row = jnp.append(by_z.reshape(-1), by_p)
         return jnp.append(value.reshape(-1), last), jnp.concatenate([rows, row[None]])
 
-    def look(self, osc, x):
+    def seen_at(self, osc, x):
         error = jnp.max(jnp.abs(self.residual(osc, x)))
         motion = motion_at(osc, self.chain, x, error, jnp.asarray(0), jnp.asarray(0))
         exists = (motion.status == Status.OK) & (self.judge(osc, motion) == Status.OK)
@@ -305,9 +305,9 @@ class AbstractForcedCondition(AbstractCondition):
         """The points that are found from a motion at a value, [1], of what is varied."""
         osc = lax.stop_gradient(variation.oscillator(value))
         some = sorted(self.beginnings_of(osc, motion), key=lambda one: one.distance)
-        return [self.point_from(variation, osc, value, one) for one in some[:TRIED]]
+        return [self.point_of(variation, osc, value, one) for one in some[:TRIED]]
 
-    def point_from(
+    def point_of(
         self, variation: Variation, osc: Oscillator, value: Any, beginning: Beginning
     ) -> BifurcationPoint:
         """The point that is found from one beginning."""

@@ -484,7 +484,8 @@ def _unexplained(path: ParameterPath, a: float, b: float) -> BifurcationPoint:
     before, after = path.beside(0.5 * (a + b))
     ends = max(before, path.inside(path.first)), min(after, path.inside(path.last))
     path.find_labels(ends)
-    oscs, cycles = (tuple(map(of, ends)) for of in (path.at, path.cycles.__getitem__))
+    oscs = path.at(ends[0]), path.at(ends[1])
+    cycles = path.cycles[ends[0]], path.cycles[ends[1]]
     return replace(_unsolved_point(path, 0.5 * (a + b), b - a), sides=sides_of(ends, oscs, cycles))
 
 

@@ -224,7 +224,7 @@ class GrazingSliding(AbstractTangency):
         return -1.0
 
     def with_clock(self):
-        return TimedGrazing(self.belt)
+        return TimedGrazing(int(self.belt))
 
     @classmethod
     def between(cls, before, after, edged):

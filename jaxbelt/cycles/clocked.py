@@ -158,7 +158,7 @@ def _timed_arc_equations(turns: int, osc: Oscillator, codes, end, mesh, unknown:
 
 
 def _and_columns(turns: int, osc, along, codes, end, mesh, unknown: Array):
-    """`_timed_arc_equations` and their derivatives by the unknowns and along directions, [4, 4 + k]."""
+    """`_timed_arc_equations` and their derivatives, by the unknowns and along, [4, 4 + k]."""
     return _timed_columns(
         functools.partial(_timed_arc_equations, turns), osc, along, codes, end, mesh, unknown
     )

@@ -261,14 +261,16 @@ class Followed(NamedTuple):
         """The last periods of it."""
         cuts = np.flatnonzero(self.ends == Ends(self.codes.shape[-1]).period)
         first = 0 if periods >= len(cuts) else cuts[-periods - 1] + 1
-        arcs = (one[first:] for one in self[:4])
-        return Followed(*arcs, self.starts[-periods - 1 :], self.status)
+        return self._cut(slice(first, None), slice(-periods - 1, None))
 
     def first(self, periods: int) -> "Followed":
         """The first periods of it."""
         cuts = np.flatnonzero(self.ends == Ends(self.codes.shape[-1]).period)
-        arcs = (one[: cuts[periods - 1] + 1] for one in self[:4])
-        return Followed(*arcs, self.starts[: periods + 1], self.status)
+        return self._cut(slice(cuts[periods - 1] + 1), slice(periods + 1))
+
+    def _cut(self, arcs: slice, starts: slice) -> "Followed":
+        parts = [one[arcs] for one in self[:4]]
+        return self._make([*parts, self.starts[starts], self.status])
 
     def loop(self) -> Loop:
         """As a loop, padded to a size of chains."""

@@ -102,7 +102,7 @@ def needed_or_rate(osc: Oscillator, mode: Mode, t: Array, x1: Array, x2: Array) 
     return mode_acceleration(at_time(osc, t), mode, x1, x2)
 
 
-def timed_lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, t0=0.0) -> Lanes:
+def timed_lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, t0: Any) -> Lanes:
     """Lanes at the start of their runs, at the time t0, without what an observer adds."""
     zero = jnp.zeros_like(x1)
     t = zero + t0

@@ -554,7 +554,7 @@ def _integrated(rates, osc, lanes: Lanes, new: _Attempt, delta, x1, x2, kept) ->
     return choose(kept, totals, lanes.integrals)
 
 
-def next_size(lanes: Lanes, new: _Attempt, going, accepted) -> tuple[Array, Array]:
+def next_size(lanes: Lanes, new: Any, going, accepted) -> tuple[Array, Array]:
     """The lanes' pace after a step, and the size of the next one by its error."""
     # NaN is a large error, too; the error is of order eight in h.
     error = jnp.where(new.error < LARGEST_ERROR, jnp.maximum(new.error, LEAST_ERROR), LARGEST_ERROR)

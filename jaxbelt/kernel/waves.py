@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from ..model.forcing import AbstractForce, BaseMotion, ConstantForce, Harmonic, Oscillating
 from ..model.modes import Mode, foremost
@@ -126,12 +126,13 @@ class StepClock(NamedTuple):
         """That of the lanes' next steps."""
         middle = t + 0.5 * h
 
-        def wave(mean, amplitude, frequency, phase, turn=0.0):
+        def wave(mean, amplitude, frequency, phase, turn: ArrayLike = 0.0):
             """`turn`: of a `BaseMotion`, amplitude (cos - turn sin)."""
             cosine, sine = cosine_and_sine(frequency * middle + phase)
             along, across = cosine - turn * sine, sine + turn * cosine
-            kept = [materialise(amplitude * x, ones) for x in (along, across)]
-            return StepWave(mean, *kept, materialise(frequency * h, ones), frequency)
+            along = materialise(amplitude * along, ones)
+            across = materialise(amplitude * across, ones)
+            return StepWave(mean, along, across, materialise(frequency * h, ones), frequency)
 
         forces, others = [], []
         for one in osc.forcing:

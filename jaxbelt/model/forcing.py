@@ -150,6 +150,9 @@ class ConstantForce(AbstractForce):
 
     amplitude: Float[Array, ""] = eqx.field(converter=_number_named("amplitude"))
 
+    def __init__(self, amplitude: ArrayLike):
+        self.amplitude = amplitude  # pyright: ignore[reportAttributeAccessIssue]
+
     @property
     def frequency(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
         return jnp.zeros(())
@@ -355,7 +358,7 @@ def as_forcing(forcing: Any) -> tuple[AbstractForce, ...]:
         forcing = (forcing,)
     fits = isinstance(forcing, Iterable) and not isinstance(forcing, str | dict | eqx.Module)
     require_value(fits, "forcing", expected, forcing)
-    forces = tuple(forcing)
+    forces: tuple[Any, ...] = tuple(forcing)
     for i, force in enumerate(forces):
         name = f"forcing[{i}]"
         require_value(isinstance(force, AbstractForce), name, expected, force)

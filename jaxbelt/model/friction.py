@@ -411,6 +411,9 @@ class Cubic(AbstractFriction):
     a1: Float[Array, ""] = eqx.field(converter=_scalar("a1"))
     a3: Float[Array, ""] = eqx.field(converter=_scalar("a3"))
 
+    def __init__(self, a0: ArrayLike, a1: ArrayLike, a3: ArrayLike):
+        self.a0, self.a1, self.a3 = a0, a1, a3  # pyright: ignore[reportAttributeAccessIssue]
+
     def __check_init__(self):
         self.check("Cubic")
 

@@ -389,7 +389,7 @@ def is_held_for_ever(osc: Oscillator, mode: Mode, y: TimedState) -> Array:
         still = still & (~touches | jnp.where(stuck, rests, jnp.asarray(constant)))
         least = load.mean - jnp.abs(load.amplitude) if isinstance(load, Oscillating) else load
         limit = limit + jnp.where(stuck, least * belt.friction.static, 0.0)
-    pushes = [force.amplitude for force in now.forcing]
+    pushes = [force.force(y[2]) for force in now.forcing]
     rest = mode_acceleration(now, mode, y[0], y[1]) - functools.reduce(jnp.add, pushes)
     bounds = [force.bound(osc.damping) for force in osc.forcing]
     largest = jnp.abs(rest) + functools.reduce(jnp.add, bounds, jnp.zeros(()))

@@ -70,14 +70,14 @@ class _March(NamedTuple):
     hit: Array
     stops: Array
     failed: Array
-    count: Array
+    steps: Array
 
 
 def _stepped(osc: Oscillator, mode: Mode, y: TimedState, h: Array):
     """The state a time h later, and an estimate of its error in x1 and x2."""
     field = functools.partial(field_at, osc, mode)
-    best, lower = increments(lambda y: field(y), y, h, _BOTH_ORDERS)
-    slipped = tuple(a + b for a, b in zip(y, best, strict=True))
+    best, lower = increments(field, y, h, _BOTH_ORDERS)
+    slipped = y[0] + best[0], y[1] + best[1], y[2] + best[2]
     errors = tuple(jnp.abs(a - b) for a, b in zip(best[:2], lower[:2], strict=True))
     stuck = mode.any_stuck
     zero = jnp.zeros_like(h)
@@ -125,7 +125,7 @@ def first_vanishing(osc: Oscillator, mode: Mode, y: TimedState, longest: Array, 
 
     def unfinished(state: _March):
         going = (state.passed < longest) & ~state.hit & ~state.stops & ~state.failed
-        return going & (state.count < MOST_TIMED_STEPS)
+        return going & (state.steps < MOST_TIMED_STEPS)
 
     def advance(state: _March) -> _March:
         rest = longest - state.passed
@@ -170,7 +170,7 @@ def first_vanishing(osc: Oscillator, mode: Mode, y: TimedState, longest: Array, 
             hit,
             stops,
             ~accurate & (h <= SHORTEST_STEP),
-            state.count + 1,
+            state.steps + 1,
         )
 
     at = look(y)
@@ -193,7 +193,7 @@ def first_vanishing(osc: Oscillator, mode: Mode, y: TimedState, longest: Array, 
     h = jnp.where(number >= 0, h, length)
     y, _ = _stepped(osc, mode, last.y, h)
     y = select(last.hit, y, last.y)
-    failed = last.failed | (last.count >= MOST_TIMED_STEPS)
+    failed = last.failed | (last.steps >= MOST_TIMED_STEPS)
     return last.passed + h, y, number, failed
 
 

@@ -9,13 +9,14 @@ Source: E. Hairer, S. P. Nørsett, G. Wanner, Solving Ordinary Differential Equa
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
-Components = tuple[Array, ...]
+Components = Any
 #: One row for two substeps: the length of one, whether they are the first of their rule, and the
 #: weights of the rule's result in what is wanted, in the last row of the rule.
 Scheme = tuple[np.ndarray, ...]

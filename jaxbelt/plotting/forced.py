@@ -1,5 +1,6 @@
 """Periodic motions of forced oscillators, and Lyapunov exponents."""
 
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 
@@ -27,7 +28,7 @@ def plot_motion(motion: PeriodicMotion, ax: Axes | None = None) -> Axes:
     ax.plot(*states.T, color="black", linestyle=style, linewidth=1.2)
     ax.plot(*np.asarray(motion.starts).T, "o", color="black", markersize=4, label="phase 0")
     osc = motion.oscillator
-    for number, belt in enumerate(at_time(osc, np.zeros(())).belts):
+    for number, belt in enumerate(at_time(osc, jnp.zeros(())).belts):
         if type(belt).__name__ == "Belt":
             velocity = float(belt.velocity) / float(osc.omega)
             colour = BELT_COLOURS[number % len(BELT_COLOURS)]

@@ -27,7 +27,7 @@ from ..kernel.lanes import Lanes, Observer, choose, materialise
 from ..kernel.step import LANDING
 from ..model.instants import field_at
 from ..model.modes import Mode, mode_acceleration
-from ..model.oscillator import at_time, has_clock
+from ..model.oscillator import Oscillator, at_time, has_clock
 from ..model.own_units import OwnOscillator
 from .moments import (
     PARTS_OF_STEP,
@@ -110,8 +110,7 @@ class Along(Observer):
         now = at_time(osc, t)
         residual = mode_acceleration(now, mode, x1, x2)
         length = osc.units.length
-        a = jnp.where(mode.any_stuck, 0.0, residual)
-        a = length * (_field(osc, mode, t, x1, x2) if has_clock(osc) else a)
+        a = length * _field(osc, mode, x1, x2, *_clock(osc, t))
         forces = jnp.stack([length * f for f in _forces(now, mode, x2, residual)], axis=-1)
 
         def rates(osc, x1, x2, *rest):
@@ -338,37 +337,35 @@ def _state_and_rate(osc: OwnOscillator, lanes: Lanes) -> tuple[Array, Array, Arr
     """x1, x2 and x2' in the mode of the lanes, which slip; without derivatives."""
     osc, lanes = lax.stop_gradient((osc, lanes))
     if has_clock(osc):
-        return lanes.x1, lanes.x2, _field(osc, lanes.mode, lanes.t, lanes.x1, lanes.x2)
+        return lanes.x1, lanes.x2, _field(osc, lanes.mode, lanes.x1, lanes.x2, lanes.t)
     return lanes.x1, lanes.x2, mode_acceleration(osc, lanes.mode, lanes.x1, lanes.x2)
 
 
-def _field(osc: OwnOscillator, mode: Mode, t: Array, x1: Array, x2: Array) -> Array:
-    """x2' of an oscillator that knows the time; the mass that sticks goes with its belt."""
-    return field_at(osc, mode, (x1, x2, t))[1]
+def _field(osc: OwnOscillator, mode: Mode, x1: Array, x2: Array, t: Array | None = None) -> Array:
+    """x2' of a mode; a mass that sticks goes with its belt. t: the time, where it is known."""
+    if t is not None:
+        return field_at(osc, mode, (x1, x2, t))[1]
+    return jnp.where(mode.any_stuck, 0.0, mode_acceleration(osc, mode, x1, x2))
+
+
+def _clock(osc: OwnOscillator, t: Array) -> tuple[Array, ...]:
+    return (t,) if has_clock(osc) else ()
 
 
 def _seen(function, osc: OwnOscillator, lanes: Lanes, x1: Array, x2: Array):
     """A section's value and rate at a state of lanes."""
-    if not has_clock(osc):
-        return value_and_rate(function, osc, lanes.mode, x1, x2)
-    a = _field(osc, lanes.mode, lanes.t, x1, x2)
+    a = _field(osc, lanes.mode, x1, x2, *_clock(osc, lanes.t))
     return value_and_rate(function, osc, lanes.mode, x1, x2, a)
 
 
 def _moved(osc: OwnOscillator, lanes: Lanes, delta: Array) -> tuple[Array, Array]:
     """The state that is `delta` away, by Taylor's formula of order 3 in x1 and 2 in x2."""
-
-    def field(x1, x2, *t):
-        if t:
-            return _field(osc, lanes.mode, *t, x1, x2)
-        a = mode_acceleration(osc, lanes.mode, x1, x2)
-        return jnp.where(lanes.mode.any_stuck, 0.0, a)
-
+    field = functools.partial(_field, osc, lanes.mode)
     x1, x2 = lanes.x1, lanes.x2
-    clock = (lanes.t,) if has_clock(osc) else ()
+    clock = _clock(osc, lanes.t)
     a = field(x1, x2, *clock)
     ways = x2, a, *map(jnp.ones_like, clock)
-    _, jerk, *_ = jax.jvp(field, (x1, x2, *clock), ways)
+    _, jerk = jax.jvp(field, (x1, x2, *clock), ways)
     x1 = x1 + delta * (x2 + delta / 2 * (a + delta / 3 * jerk))
     return x1, x2 + delta * (a + delta / 2 * jerk)
 
@@ -391,7 +388,7 @@ def _next(times: tuple[float, ...], passed: Array) -> Array:
     return jnp.asarray((*times, np.inf))[jnp.minimum(passed, len(times))]
 
 
-def _forces(osc: OwnOscillator, mode: Mode, x2: Array, residual: Array) -> list[Array]:
+def _forces(osc: Oscillator, mode: Mode, x2: Array, residual: Array) -> list[Array]:
     """Friction force of each belt on the mass; stuck belts share the holding force by capacity."""
     limits = [
         jnp.where(stuck, belt.load * belt.friction.static, 0.0)

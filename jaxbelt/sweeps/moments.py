@@ -171,10 +171,9 @@ def _x2_rate(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
 
 
 def value_and_rate(
-    function: Callable[..., Array], osc: Oscillator, mode: Mode, x1: Array, x2: Array
+    function: Callable[..., Array], osc: Oscillator, mode: Mode, x1: Array, x2: Array, a: Array
 ) -> tuple[Array, Array]:
-    """Value of a section and its derivative by time, along the field of the mode."""
-    a = jnp.where(mode.any_stuck, 0.0, mode_acceleration(osc, mode, x1, x2))
+    """Value of a section and its derivative by time, where x2' = a."""
     value, rate, *_ = jax.jvp(lambda x1, x2: function(osc, mode, x1, x2), (x1, x2), (x2, a))
     return value, rate
 

@@ -56,7 +56,7 @@ class Question:
     derivatives: tuple[str, ...]
 
     @classmethod
-    def of(cls, make, axes, y0, t1, rtol, atol, observe, derivatives, t0=0.0) -> "Question":
+    def of(cls, make, axes, y0, t1, rtol, atol, observe, derivatives, t0: Any = 0.0) -> "Question":
         """Checks the arguments of `sweep`."""
         require_usable_jax()
         grid = Grid(make, axes, y0)
