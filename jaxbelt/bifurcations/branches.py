@@ -41,27 +41,27 @@ from .systems import WEIGHT
 from .tangencies import GrazingSliding
 
 #: First, shortest and longest step, of which the parameter's part is measured in parts of the span.
-FIRST, SHORTEST, LONGEST = 2e-3, 1e-7, 2e-2
+FIRST_STEP_OF_BRANCH, SHORTEST_STEP_OF_BRANCH, LONGEST_STEP_OF_BRANCH = 2e-3, 1e-7, 2e-2
 #: Cosine of the largest angle between tangents of neighbours.
-STRAIGHT = 0.95
+STRAIGHT_BRANCH = 0.95
 #: Steps on each side at most.
-MOST_ROWS = 400
+MOST_MOTIONS = 400
 #: How far beyond a point a motion with another signature is looked for, in parts of the span.
-BEYOND = (1e-5, 1e-4, 1e-3)
+BEYOND_POINT = (1e-5, 1e-4, 1e-3)
 #: States that a branch reaches beyond a point are no farther than this from it.
-NEAR = 0.1
+NEAR_POINT = 0.1
 #: How far along the direction that a period doubling shows the motion that leaves is looked for.
 LEAVES = (1e-3, 1e-2, 5e-2)
 
 
-class Row(NamedTuple):
+class MotionRow(NamedTuple):
     """A motion of a branch and where it is."""
 
     value: float
     motion: PeriodicMotion
 
 
-class Line(NamedTuple):
+class ForcedLine(NamedTuple):
     """What is varied, and between which values."""
 
     variation: Variation
@@ -79,11 +79,11 @@ class Line(NamedTuple):
 
 def forced_branches(
     variation: Variation, span: tuple[float, float], start: PeriodicMotion, value: float
-) -> tuple[list[list[Row]], list[BifurcationPoint]]:
+) -> tuple[list[list[MotionRow]], list[BifurcationPoint]]:
     """The branch of a motion at a value, within a span, to both sides, and those that leave it at
     period doublings; and the points on them. All in own units."""
-    line = Line(variation, *span, turns_of(start.oscillator))
-    branches, points, waiting = [], [], [(Row(value, start), True)]
+    line = ForcedLine(variation, *span, turns_of(start.oscillator))
+    branches, points, waiting = [], [], [(MotionRow(value, start), True)]
     while waiting:
         row, is_first = waiting.pop(0)
         sides = [_side_of_point(line, row, sign) for sign in (-1.0, 1.0)]
@@ -99,7 +99,7 @@ def forced_branches(
     return branches, sorted(points, key=lambda point: float(point.value))
 
 
-def _is_known_motion(point: BifurcationPoint, other: BifurcationPoint, line: Line) -> bool:
+def _is_known_motion(point: BifurcationPoint, other: BifurcationPoint, line: ForcedLine) -> bool:
     close = abs(float(point.value) - float(other.value)) < 1e-8 * line.length
     return close and type(point.condition) is type(other.condition) and _same(point, other)
 
@@ -111,15 +111,15 @@ def _same(point: BifurcationPoint, other: BifurcationPoint) -> bool:
 # --- one leg: a fixed signature -------------------------------------------------------------------
 
 
-class Leg(NamedTuple):
+class MotionLeg(NamedTuple):
     """A fixed signature: its chain, and what the unknowns and the parameter are measured in."""
 
-    line: Line
+    line: ForcedLine
     chain: TimedChain
     weights: Array
 
     @classmethod
-    def of(cls, line: Line, row: Row) -> tuple["Leg", np.ndarray]:
+    def of(cls, line: ForcedLine, row: MotionRow) -> tuple["MotionLeg", np.ndarray]:
         z = np.asarray(row.motion.unknowns)
         weights = WEIGHT / (1 + np.abs(z.reshape(-1)))
         u = np.append(weights * z.reshape(-1), row.value / line.length)
@@ -140,10 +140,10 @@ class Leg(NamedTuple):
         solved, settled = self.line.variation.relinearised(attempt, begun)
         return solved._replace(found=bool(solved.found) and bool(settled))
 
-    def row(self, u: np.ndarray) -> Row:
+    def row(self, u: np.ndarray) -> MotionRow:
         z = (u[:-1] / np.asarray(self.weights)).reshape(-1, 4)
         value = float(self.line.length * u[-1])
-        return Row(value, _motion_of_row(self.line.at(value), self.chain, jnp.asarray(z)))
+        return MotionRow(value, _motion_of_row(self.line.at(value), self.chain, jnp.asarray(z)))
 
 
 def _linearized_motion(
@@ -162,10 +162,12 @@ def _motion_of_row(osc: Oscillator, chain: TimedChain, z: Array) -> PeriodicMoti
     return motion_at(osc, chain, z, jnp.zeros(()), none, none)
 
 
-def _side_of_point(line: Line, row: Row, sign: float) -> tuple[list[Row], list[BifurcationPoint]]:
+def _side_of_point(
+    line: ForcedLine, row: MotionRow, sign: float
+) -> tuple[list[MotionRow], list[BifurcationPoint]]:
     """The branch to one side of a motion: leg by leg."""
     rows, points = [row], []
-    while len(rows) < MOST_ROWS:
+    while len(rows) < MOST_MOTIONS:
         note_progress(f"{len(rows)} motions on one side")
         ahead, found, direction = _branch_leg(line, rows[-1], sign)
         rows += ahead
@@ -181,22 +183,22 @@ def _side_of_point(line: Line, row: Row, sign: float) -> tuple[list[Row], list[B
 
 
 def _branch_leg(
-    line: Line, row: Row, sign: float
-) -> tuple[list[Row], list[BifurcationPoint], float | None]:
+    line: ForcedLine, row: MotionRow, sign: float
+) -> tuple[list[MotionRow], list[BifurcationPoint], float | None]:
     """The motions after a row with its signature, the points on the way, and the sense in which the
     parameter goes where the signature ends in the last one of these; None where there is none."""
-    leg, u = Leg.of(line, row)
+    leg, u = MotionLeg.of(line, row)
     axis = np.zeros_like(u)
     axis[-1] = 1.0
     begun = leg.corrected(u, axis, 0.0)
     if not begun.found:
         return [], [], None
     u, tangent = begun.u, sign * begun.tangent * np.sign(begun.tangent[-1])
-    rows, points, step = [], [], FIRST
+    rows, points, step = [], [], FIRST_STEP_OF_BRANCH
     last = row
-    while len(rows) < MOST_ROWS and step > SHORTEST:
+    while len(rows) < MOST_MOTIONS and step > SHORTEST_STEP_OF_BRANCH:
         solved = leg.corrected(u, tangent, step)
-        if not solved.found or solved.tangent @ tangent < STRAIGHT:
+        if not solved.found or solved.tangent @ tangent < STRAIGHT_BRANCH:
             step *= 0.5
             continue
         new = leg.row(solved.u)
@@ -210,14 +212,16 @@ def _branch_leg(
                 return rows, [*points, point], float(np.sign(tangent[-1]))
             step *= 0.5
             continue
-        points += list(_between_rows(line, last, new))
+        points += list(_points_between(line, last, new))
         rows.append(new)
-        step = min(LONGEST, 1.5 * step)
+        step = min(LONGEST_STEP_OF_BRANCH, 1.5 * step)
         u, tangent, last = solved.u, solved.tangent, new
     return rows, points, None
 
 
-def _at_end(leg: Leg, u: np.ndarray, beyond: np.ndarray, end: float, line: Line) -> list[Row]:
+def _at_end(
+    leg: MotionLeg, u: np.ndarray, beyond: np.ndarray, end: float, line: ForcedLine
+) -> list[MotionRow]:
     part = (end / line.length - u[-1]) / (beyond[-1] - u[-1])
     guess = u + part * (beyond - u)
     axis = np.zeros_like(u)
@@ -238,7 +242,9 @@ def _tests(motion: PeriodicMotion) -> dict[type[AbstractForcedCondition], float]
     return {PeriodDoubling: 1 + trace + det, Fold: 1 - trace + det, Torus: torus}
 
 
-def _between_rows(line: Line, one: Row, other: Row) -> Iterator[BifurcationPoint]:
+def _points_between(
+    line: ForcedLine, one: MotionRow, other: MotionRow
+) -> Iterator[BifurcationPoint]:
     """The points of multipliers between two motions of one signature."""
     before, after = _tests(one.motion), _tests(other.motion)
     for kind in before:
@@ -250,22 +256,28 @@ def _between_rows(line: Line, one: Row, other: Row) -> Iterator[BifurcationPoint
         yield from fine[:1]
 
 
-def _points(line: Line, condition: AbstractCondition, row: Row) -> list[BifurcationPoint]:
+def _points(
+    line: ForcedLine, condition: AbstractCondition, row: MotionRow
+) -> list[BifurcationPoint]:
     timed = condition.with_clock()
     found = timed.points(line.variation, np.array([row.value]), row.motion)
     return [replace(p, condition=condition) for p in found if int(p.status) == Status.OK]
 
 
-def _rows_are_beside(line: Line, point: BifurcationPoint, one: Row, other: Row) -> bool:
+def _rows_are_beside(
+    line: ForcedLine, point: BifurcationPoint, one: MotionRow, other: MotionRow
+) -> bool:
     """Whether a point is as near to two motions as they are to each other, about."""
     starts = np.asarray(one.motion.start), np.asarray(other.motion.start)
     apart = np.max(np.abs(starts[0] - starts[1])) + 1e-6
-    reach = 2 * abs(other.value - one.value) + 2 * LONGEST * line.length
+    reach = 2 * abs(other.value - one.value) + 2 * LONGEST_STEP_OF_BRANCH * line.length
     away = np.max(np.abs(np.asarray(point.cycle.start) - starts[0]))
     return abs(float(point.value) - one.value) <= reach and bool(away <= 5 * apart + 0.01)
 
 
-def _border(line: Line, last: Row, new: Row, change: float) -> BifurcationPoint | None:
+def _border(
+    line: ForcedLine, last: MotionRow, new: MotionRow, change: float
+) -> BifurcationPoint | None:
     """The point in which the signature of the last motion ends before the new one, None where the
     conditions find none so near."""
     belts = range(last.motion.chain.codes.shape[-1])
@@ -277,14 +289,14 @@ def _border(line: Line, last: Row, new: Row, change: float) -> BifurcationPoint 
 
 
 def _beyond_point(
-    line: Line, last: Row, point: BifurcationPoint, direction: float
-) -> tuple[Row, float] | None:
+    line: ForcedLine, last: MotionRow, point: BifurcationPoint, direction: float
+) -> tuple[MotionRow, float] | None:
     """A motion beyond the point in which a signature ended, and the sense in which to go on."""
     at, value = np.asarray(point.cycle.start), float(point.value)
     periods = last.motion.periods
     moved = at - np.asarray(last.motion.start)
     for side in (1.0, -1.0):
-        for part in BEYOND:
+        for part in BEYOND_POINT:
             there = value + side * direction * part * line.length
             if not line.first <= there <= line.last:
                 continue
@@ -293,15 +305,15 @@ def _beyond_point(
             for stretch in (0.0, part, -part):
                 motion = periodic_from(osc, at + stretch * moved, periods, line.turns)
                 fine = int(motion.status) == Status.OK and motion.periods == periods
-                if not fine or np.max(np.abs(np.asarray(motion.start) - at)) > NEAR:
+                if not fine or np.max(np.abs(np.asarray(motion.start) - at)) > NEAR_POINT:
                     continue
                 if own is not None and is_same_motion(own, motion):
                     continue
-                return Row(there, motion), side * direction
+                return MotionRow(there, motion), side * direction
     return None
 
 
-def _leaving(line: Line, point: BifurcationPoint) -> Row | None:
+def _leaving(line: ForcedLine, point: BifurcationPoint) -> MotionRow | None:
     """A motion of twice the period beside a period doubling."""
     at, value = np.asarray(point.cycle.start), float(point.value)
     periods = 2 * point.cycle.periods
@@ -315,5 +327,5 @@ def _leaving(line: Line, point: BifurcationPoint) -> Row | None:
                 guess = at + size * np.array([np.cos(angle), np.sin(angle)])
                 motion = periodic_from(osc, guess, periods, line.turns)
                 if int(motion.status) == Status.OK and motion.periods == periods:
-                    return Row(there, motion)
+                    return MotionRow(there, motion)
     return None

@@ -93,7 +93,7 @@ class CrossingSliding(AbstractStickCondition):
     line: ClassVar[Line] = Line("crossing-sliding", "#CC79A7", (0, (5, 1.5)))
 
     def with_clock(self):
-        return TimedCrossing(int(self.belt))
+        return TimedCrossing(int(self.belt), type(self))
 
     @property
     def room(self):
@@ -133,9 +133,6 @@ class CrossingSliding(AbstractStickCondition):
     def between(cls, before, after, edged):
         one, other = (label.events(EventKind.CROSS) for label in (before, after))
         return [cls(belt) for belt in (one - other) + (other - one)]
-
-
-TimedCrossing.public = CrossingSliding
 
 
 class Arrival(eqx.Module):

@@ -38,7 +38,7 @@ from ..numerics.compiling import jit
 from ..results import Status, draw
 from ..tables import per_belt, table_of
 from .base import BifurcationPoint, given_point
-from .branches import Row, forced_branches
+from .branches import MotionRow, forced_branches
 from .cells import in_plane_of_paper, region_name
 from .forced import motions_to_begin_from, place_of_motion
 from .labels import Label
@@ -357,7 +357,7 @@ def _start_of_branch(
     return motions[0], value
 
 
-def _branch_of_motions(rows: Sequence[Row]) -> Branch:
+def _branch_of_motions(rows: Sequence[MotionRow]) -> Branch:
     motions = tuple(row.motion for row in rows)
     places = np.array([place_of_motion(motion) for motion in motions])
     sticks = np.array([np.asarray(motion.stick_durations) for motion in motions])

@@ -76,7 +76,15 @@ TRIED = 3
 #: A multiplier that is off by less is the one that the condition asks for.
 ON_CIRCLE = 1e-6
 #: States from which motions are looked for, in own units.
-STARTS = ((0.5, 0.0), (0.0, 0.0), (-0.5, 0.0), (1.5, 0.0), (-1.5, 0.0), (0.0, 0.5), (3.0, 0.0))
+STARTS_OF_MOTIONS = (
+    (0.5, 0.0),
+    (0.0, 0.0),
+    (-0.5, 0.0),
+    (1.5, 0.0),
+    (-1.5, 0.0),
+    (0.0, 0.5),
+    (3.0, 0.0),
+)
 
 
 # --- systems --------------------------------------------------------------------------------------
@@ -230,7 +238,7 @@ class AtLimit(TimedSystem):
 # --- what conditions have in common ---------------------------------------------------------------
 
 
-class Rows(NamedTuple):
+class ArcRows(NamedTuple):
     """The arcs of a known motion, in NumPy: codes, ends, and unknowns [arcs, 4]."""
 
     codes: np.ndarray
@@ -238,21 +246,21 @@ class Rows(NamedTuple):
     z: np.ndarray
 
     @classmethod
-    def of(cls, motion: PeriodicMotion) -> "Rows":
+    def of(cls, motion: PeriodicMotion) -> "ArcRows":
         used = np.asarray(motion.chain.used)
         parts = motion.chain.codes, motion.chain.ends, motion.unknowns
         return cls(*(np.asarray(part)[used] for part in parts))
 
-    def put(self, first: int, last: int, *rows: tuple[Any, int, Any]) -> "Rows":
+    def put(self, first: int, last: int, *rows: tuple[Any, int, Any]) -> "ArcRows":
         """With (codes, end, unknowns) in place of the arcs from the first up to the last one."""
         new = [np.array(list(column)) for column in zip(*rows, strict=True)]
         parts = [
             np.concatenate([own[:first], some.astype(own.dtype), own[last + 1 :]])
             for own, some in zip(self, new, strict=True)
         ]
-        return Rows(*parts)
+        return ArcRows(*parts)
 
-    def cut(self, row: int, since: float, state: np.ndarray, end: int) -> "Rows":
+    def cut(self, row: int, since: float, state: np.ndarray, end: int) -> "ArcRows":
         """With an arc cut where it is at `state`, (x1, x2, t), by that end."""
         codes, z = self.codes[row], self.z[row]
         first = (codes, end, np.append(z[:3], since))
@@ -266,22 +274,18 @@ class Rows(NamedTuple):
 class Beginning(NamedTuple):
     """Arcs near a point, how far from it they seem to be, and what makes its system of a chain."""
 
-    rows: Rows
+    rows: ArcRows
     distance: float
     system: Any
 
 
 class AbstractForcedCondition(AbstractCondition):
-    """A condition on a periodic motion of a forced oscillator.
+    """A condition on a periodic motion of a forced oscillator."""
 
-    public: the class that users know it by, where that serves oscillators without a clock, too.
-    """
-
-    public: ClassVar[type[AbstractCondition] | None] = None
     ends_at_contact: ClassVar[bool] = True
 
     def kind_along(self, osc, multiplier):
-        return self.public or type(self)
+        return type(self)
 
     def check(self, osc):
         super().check(osc)
@@ -422,7 +426,7 @@ def motions_to_begin_from(osc: OwnOscillator, start: Any, turns: int) -> Sequenc
         motion = attracted(osc, np.asarray(osc.units.into(start)), turns)
         found = [motion] if int(motion.status) == Status.OK else []
     else:
-        found = motions_of(osc, STARTS, turns)
+        found = motions_of(osc, STARTS_OF_MOTIONS, turns)
     for motion in list(found):
         half, odd = divmod(motion.periods, 2)
         if not odd:
@@ -444,7 +448,9 @@ class _UnitCircle(AbstractForcedCondition):
         near = min(abs(first - wanted), abs(second - wanted))
         distance = near if self.parts[1] else abs(abs(first) - 1)
         parts = jnp.asarray(self.parts)
-        yield Beginning(Rows.of(motion), float(distance), lambda chain: OnUnitCircle(chain, parts))
+        yield Beginning(
+            ArcRows.of(motion), float(distance), lambda chain: OnUnitCircle(chain, parts)
+        )
 
 
 class PeriodDoubling(_UnitCircle):
@@ -481,12 +487,16 @@ class Torus(_UnitCircle):
 
 
 class TimedGrazing(AbstractForcedCondition):
-    """`GrazingSliding` with a clock."""
+    """`GrazingSliding` with a clock; public: that class."""
 
     belt: int
+    public: type[AbstractCondition] = eqx.field(static=True)
+
+    def kind_along(self, osc, multiplier):
+        return self.public
 
     def beginnings_of(self, osc, motion, known=False):
-        rows, k = Rows.of(motion), int(self.belt)
+        rows, k = ArcRows.of(motion), int(self.belt)
         names = Ends(rows.codes.shape[1])
 
         def system(row):
@@ -520,7 +530,7 @@ class _AtArrival(AbstractForcedCondition):
     rises: ClassVar[float]
 
     def beginnings_of(self, osc, motion, known=False):
-        rows, k, way = Rows.of(motion), int(self.belt), jnp.asarray(self.rises)
+        rows, k, way = ArcRows.of(motion), int(self.belt), jnp.asarray(self.rises)
 
         def system(row, held):
             return lambda chain: AtLimit(chain, jnp.asarray(row), held, way)
@@ -556,9 +566,14 @@ def _excess(osc: Oscillator, codes: Array, y: Array) -> tuple[Array, Array]:
 
 
 class TimedCrossing(_AtArrival):
-    """`CrossingSliding` with a clock."""
+    """`CrossingSliding` with a clock; public: that class."""
+
+    public: type[AbstractCondition] = eqx.field(static=True)
 
     rises: ClassVar[float] = 1.0
+
+    def kind_along(self, osc, multiplier):
+        return self.public
 
 
 class SwitchingSliding(_AtArrival):
@@ -591,7 +606,7 @@ class AddingSliding(AbstractForcedCondition):
     line: ClassVar[Line] = Line("adding-sliding", "#56B4E9", (0, (5, 1.5)))
 
     def beginnings_of(self, osc, motion, known=False):
-        rows, k = Rows.of(motion), int(self.belt)
+        rows, k = ArcRows.of(motion), int(self.belt)
         names = Ends(rows.codes.shape[1])
 
         def system(row, codes):

@@ -224,16 +224,13 @@ class GrazingSliding(AbstractTangency):
         return -1.0
 
     def with_clock(self):
-        return TimedGrazing(int(self.belt))
+        return TimedGrazing(int(self.belt), type(self))
 
     @classmethod
     def between(cls, before, after, edged):
         # Whether a tangency is a fold or grazing shows at the solution.
         one, other = (label.events(EventKind.STICK) for label in (before, after))
         return [cls(belt) for belt in (one - other) + (other - one)]
-
-
-TimedGrazing.public = GrazingSliding
 
 
 # --- guesses --------------------------------------------------------------------------------------

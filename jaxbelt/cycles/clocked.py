@@ -49,7 +49,7 @@ from .shooting import (
 
 #: A step times the density of steps that is wanted there: of order twelve, so that what a step
 #: leaves is rounding.
-STRIDE = 0.25
+TIMED_STRIDE = 0.25
 #: The smallest mesh of an arc; steps by which steps are placed, for each that an arc may have.
 LEAST_STEPS, PLACING = 8 * ARC_STEPS, 2
 #: Periods of forces have a common multiple if their ratios have denominators up to this.
@@ -102,7 +102,7 @@ def _counted_ends(osc: Oscillator, codes: Array, entries: Array, durations: Arra
 
         _, rho = lax.scan(advance, y, None, length=LEAST_STEPS)
         mean = jnp.mean(jnp.clip(jnp.nan_to_num(rho, nan=1.0), 1.0, 100.0))
-        return jnp.where(mode_of(codes).any_stuck, 0.0, duration * mean / STRIDE)
+        return jnp.where(mode_of(codes).any_stuck, 0.0, duration * mean / TIMED_STRIDE)
 
     return lax.map(lambda row: one(*row), (codes, entries, durations))
 
@@ -122,7 +122,7 @@ def timed_mesh(osc: Oscillator, size: int, codes: Array, y: Array, duration: Arr
     rho = jnp.concatenate([density(osc, mode_of(codes), y[0], y[1], y[2])[None], rest])
     rho = jnp.clip(jnp.nan_to_num(rho, nan=1.0), 1.0, 100.0)
     share = jnp.concatenate([jnp.zeros(1), jnp.cumsum(0.5 * (rho[1:] + rho[:-1]))])
-    count = jnp.clip(jnp.ceil(duration * share[-1] / n / STRIDE), 1, size)
+    count = jnp.clip(jnp.ceil(duration * share[-1] / n / TIMED_STRIDE), 1, size)
     places = jnp.minimum(jnp.arange(size + 1.0) / count, 1.0)
     grid = jnp.interp(places, share / share[-1], jnp.linspace(0, 1, n + 1))
     return jnp.where(slips, jnp.diff(grid), jnp.zeros(size).at[0].set(1.0))

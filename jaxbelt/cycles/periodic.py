@@ -59,11 +59,11 @@ if TYPE_CHECKING:
 #: Periods that are followed in one run, which are the most that a motion may have.
 PERIODS_AT_ONCE = 32
 #: Runs after which an orbit that has not come near a periodic motion is given up.
-MOST_RUNS = 32
+MOST_STARTS = 32
 #: States after n periods that differ by less, relative to their size, may be one motion's.
 NEARLY_BACK, HARDLY_BACK = 1e-6, 1e-2
 #: Errors that the steps of integration leave in the equations; with more they are halved, so often.
-EXACT, HALVINGS = 1e-11, 3
+EXACT_MOTION, MESH_HALVINGS = 1e-11, 3
 #: States that differ by less are one, where the least number of periods is asked for.
 SAME_STATE = 1e-7
 #: Newton steps on the state at phase 0 where the arcs that were followed are not those sought.
@@ -400,9 +400,9 @@ def solved_from(osc: Oscillator, loop: Loop, turns: int) -> PeriodicMotion:
     """The motion that a loop nearly is, with as many steps of integration as it takes."""
     chain, guess = _timed_chain_of(osc, loop, least_steps(osc, loop), turns)
     motion, error = _polished_motion(osc, chain, guess)
-    for _ in range(HALVINGS):
+    for _ in range(MESH_HALVINGS):
         converged = int(motion.status) in (Status.OK, Status.NOT_ADMISSIBLE)
-        if not converged or float(error) < EXACT:
+        if not converged or float(error) < EXACT_MOTION:
             break
         chain = replace(chain, mesh=jnp.repeat(0.5 * chain.mesh, 2, axis=1))
         finer, remaining = _polished_motion(osc, chain, guess)
@@ -439,7 +439,7 @@ def periodic_from(osc: Oscillator, guess: Any, periods: int, turns: int) -> Peri
         motion = solved_from(osc, followed.loop(), turns)
         if int(motion.status) in (Status.OK, Status.NEUTRAL):
             return _of_least_periods(osc, motion, turns)
-        change = _newton_step(osc, followed, turns)
+        change = _period_step(osc, followed, turns)
         size = float(np.max(np.abs(change)))
         if not np.isfinite(size):
             break
@@ -447,7 +447,7 @@ def periodic_from(osc: Oscillator, guess: Any, periods: int, turns: int) -> Peri
     return motion if motion is not None else nothing_found(osc, turns, Status.NO_CONVERGENCE)
 
 
-def _newton_step(osc: Oscillator, followed: Followed, turns: int) -> np.ndarray:
+def _period_step(osc: Oscillator, followed: Followed, turns: int) -> np.ndarray:
     """How far the state at the phase 0 is from that of a periodic motion, by Newton's method along
     the orbit as it was followed."""
     loop = followed.loop()
@@ -527,12 +527,12 @@ def _differentiable_motion(osc: Oscillator, y: Array, find: Any) -> PeriodicMoti
 def attracted(osc: Oscillator, y0: Any, turns: int) -> PeriodicMotion:
     """The periodic motion that a start leads to, of a known oscillator in its own units."""
     y, tried = np.asarray(y0, float), 1
-    for run in range(MOST_RUNS):
+    for run in range(MOST_STARTS):
         followed = arcs_over(osc, y, turns)
         if len(followed.starts) <= PERIODS_AT_ONCE:
             return nothing_found(osc, turns, followed.status or Status.NOT_FINITE.value)
         # Slow motions are tried now and then.
-        slow = run + 1 == tried or run == MOST_RUNS - 1
+        slow = run + 1 == tried or run == MOST_STARTS - 1
         tried *= 1 + slow
         found = _repeated(osc, followed, HARDLY_BACK if slow else NEARLY_BACK, turns)
         if found is not None:

@@ -76,19 +76,19 @@ from .waves import StepClock, StepWave
 #: is then good to 1e-9, and steps that end at its root are made again.
 LONGEST_STUCK = 1.2
 #: Rounding of guards, over their size: of boundaries and edges, and of what is needed.
-ROUNDING, NEEDED_ROUNDING = 1e-15, 1e-13
+GUARD_DOUBT, NEEDED_ROUNDING = 1e-15, 1e-13
 #: Steps shorter than this have their polynomials from values and slopes alone: what the integral
 #: adds is rounding.
-SHORT = 1e-3
+SHORT_TIMED_STEP = 1e-3
 #: No step is asked twice below this one, over the time that a Taylor step bridges.
-SHORTEST = 1e-4
+SHORTEST_TIMED_STEP = 1e-4
 #: Of the highest coefficient of what is needed, how far the polynomial may be off.
 LAST_TERM = 1e-4
 #: Error of the time of slip onset that needs no shorter step, over `LANDS_WITHIN` of the tolerance.
-STRAIGHT = 1.0
+STRAIGHT_GUARD = 1.0
 #: The stages, by their number, whose times make the polynomial of what is needed, beside the
 #: start, 0: of all of them the rounding would be a thousand times as large.
-STAGES = (2, 6, 4, 7, 8, 9, 10, 13)
+TIMED_STAGES = (2, 6, 4, 7, 8, 9, 10, 13)
 
 
 def _of_lanes(function: Callable, osc: Oscillator, *args: Any) -> Any:
@@ -183,9 +183,9 @@ def timed_window_of(osc: Oscillator, lanes: Lanes, *, extrema: Array | None = No
     return TimedWindow(mode.signs, stuck, ~lanes.done, most, found, numbers)
 
 
-class _Attempt(eqx.Module):
+class _TimedAttempt(eqx.Module):
     """A step of size h, not yet accepted, as `step._Attempt`; rate: x2' at the end, of lanes that
-    stick the belt's; needed: what stuck belts have to hold, at the start and at `STAGES`."""
+    stick the belt's; needed: what stuck belts have to hold, at the start and at `TIMED_STAGES`."""
 
     h: Array
     x1: Array
@@ -199,7 +199,7 @@ class _Attempt(eqx.Module):
 
 def _timed_attempt(
     osc, clock: StepClock, window: TimedWindow, lanes: Lanes, rtol, atol, rates
-) -> _Attempt:
+) -> _TimedAttempt:
     """One Runge-Kutta step of all lanes that slip; those that stick follow their belt."""
     own, h, ones, mode, stuck = nystroem(), clock.h, clock.ones, lanes.mode, window.stuck
     x1, x2, stages = lanes.x1, lanes.x2, [lanes.a]
@@ -233,8 +233,8 @@ def _timed_attempt(
     integrals = jax.tree.map(lambda i, *s: i + h * combine(own.a[-1], s), lanes.integrals, *slopes)
     end = clock.at(1.0)
     rate = jnp.where(stuck, _rate_of_stick(end, mode), stages[-1])
-    needed = [stages[i] for i in (0, *STAGES)]
-    return _Attempt(h, y1, y2, stages[-1], rate, lax.stop_gradient(error), integrals, needed)
+    needed = [stages[i] for i in (0, *TIMED_STAGES)]
+    return _TimedAttempt(h, y1, y2, stages[-1], rate, lax.stop_gradient(error), integrals, needed)
 
 
 def timed_flown(
@@ -261,11 +261,11 @@ def _rate_of_stick(now: Oscillator, mode: Mode) -> Array:
     return foremost(now, mode.stuck, rates, zero) / now.omega
 
 
-class _Meeting(eqx.Module):
+class _GuardMeeting(eqx.Module):
     """What a step has to do with one guard.
 
-    once, cut, there: see `control_points.Passage`; delta: the time from the end of the step on to
-    where it vanishes, NEVER where no Taylor step leads there. number: of the guard.
+    once, cut, there: see `control_points.RootPassage`; delta: the time from the end of the step on
+    to where it vanishes, NEVER where no Taylor step leads there. number: of the guard.
     """
 
     once: Array
@@ -275,11 +275,11 @@ class _Meeting(eqx.Module):
     number: Array
 
 
-def _meeting(points, doubt, rounding, ends, h, room, reach, number) -> _Meeting:
+def _meeting(points, doubt, rounding, ends, h, room, reach, number) -> _GuardMeeting:
     """ends: the guard's (value, slope) at the start and at the end, by the time; room: see
     `step.LANDS_WITHIN`."""
     (_, slope0), (value, slope) = ends
-    met = passage(points, doubt, rounding, h < SHORTEST * reach)
+    met = passage(points, doubt, rounding, h < SHORTEST_TIMED_STEP * reach)
     bend = (slope - slope0) / jnp.where(h > 0, h, 1.0)
     falls = slope < 0
     near = jnp.abs(value) * jnp.maximum(-slope, SLOW * jnp.abs(bend)) <= reach * slope * slope
@@ -289,7 +289,7 @@ def _meeting(points, doubt, rounding, ends, h, room, reach, number) -> _Meeting:
     near = near & falls & straight & (value - depth < -rounding)
     delta = -value / jnp.where(near, slope, 1.0)
     delta = delta - 0.5 * bend * delta * delta / jnp.where(near, slope, 1.0)
-    return _Meeting(
+    return _GuardMeeting(
         met.once, met.cut, met.there, jnp.where(near, delta, NEVER), jnp.asarray(number)
     )
 
@@ -301,12 +301,14 @@ def _quartic(start, end, change, h) -> list[Array]:
     m0, m1 = h * s0, h * s1
     rise = f1 - f0
     k4 = 30 * (change / jnp.where(h > 0, h, 1.0) - 0.5 * (f0 + f1) - (m0 - m1) / 12)
-    k4 = jnp.where(h < SHORT, 0.0, k4)
+    k4 = jnp.where(h < SHORT_TIMED_STEP, 0.0, k4)
     c2, c3 = 3 * rise - 2 * m0 - m1, m0 + m1 - 2 * rise
     return [f0, m0, c2 + k4, c3 - 2 * k4, k4]
 
 
-def _meetings(osc, clock: StepClock, window: TimedWindow, lanes: Lanes, new: _Attempt, rtol, atol):
+def _meetings(
+    osc, clock: StepClock, window: TimedWindow, lanes: Lanes, new: _TimedAttempt, rtol, atol
+):
     """What the step has to do with each guard of its mode."""
     h, n, ones = clock.h, len(osc.belts), clock.ones
     reach = LANDING * jnp.sqrt(rtol)
@@ -316,7 +318,7 @@ def _meetings(osc, clock: StepClock, window: TimedWindow, lanes: Lanes, new: _At
     rate0 = jnp.where(stuck, _rate_of_stick(start, mode), lanes.a)
     own = _quartic((lanes.x2, rate0), (new.x2, new.rate), new.x1 - lanes.x1, h)
     own = [materialise(k, ones) for k in own]
-    found, fuzz = [], ROUNDING * blur(lanes.t)
+    found, fuzz = [], GUARD_DOUBT * blur(lanes.t)
     for i, code in enumerate(mode.codes):
         slips = jnp.abs(code) == 1
         v = clock.velocities[i]
@@ -359,7 +361,7 @@ def _meetings(osc, clock: StepClock, window: TimedWindow, lanes: Lanes, new: _At
     limit = where_any(
         stuck,
         lambda: _limit_of_stick(osc, clock, window, lanes, new, room, reach),
-        _Meeting(no, no, none + 1, none + NEVER, jnp.full_like(lanes.hit, 3 * n)),
+        _GuardMeeting(no, no, none + 1, none + NEVER, jnp.full_like(lanes.hit, 3 * n)),
     )
     asked = stuck & (lanes.status != Status.STUCK_FOREVER.value)
     once, cut, delta = limit.once & asked, limit.cut & asked, jnp.where(asked, limit.delta, NEVER)
@@ -367,13 +369,15 @@ def _meetings(osc, clock: StepClock, window: TimedWindow, lanes: Lanes, new: _At
     return found
 
 
-def _limit_of_stick(osc, clock: StepClock, window, lanes, new: _Attempt, room, reach) -> _Meeting:
+def _limit_of_stick(
+    osc, clock: StepClock, window, lanes, new: _TimedAttempt, room, reach
+) -> _GuardMeeting:
     """The meeting with a limit of what stuck belts can hold, capacity -+ needed: the nearer one.
 
     Where it may meet both the step is cut.
     """
     own, n, h = nystroem(), len(osc.belts), clock.h
-    nodes = tuple(round(float(own.c[i]), 12) for i in (0, *STAGES))
+    nodes = tuple(round(float(own.c[i]), 12) for i in (0, *TIMED_STAGES))
     matrix = through(nodes)
     needed = [materialise(combine(row, new.needed), clock.ones) for row in matrix]
 
@@ -401,13 +405,13 @@ def _limit_of_stick(osc, clock: StepClock, window, lanes, new: _Attempt, room, r
     ends[1] = (points[-1], ends[1][1])
     number = jnp.where(way < 0, 3 * n, 3 * n + 1).astype(lanes.hit.dtype)
     one = _meeting(points, doubt, fuzz, ends, h, room, reach, number)
-    both = (jnp.maximum(*least) <= doubt) & (h > SHORTEST * reach)
+    both = (jnp.maximum(*least) <= doubt) & (h > SHORTEST_TIMED_STEP * reach)
     one = replace(one, cut=one.cut | both, there=jnp.where(both, 0.5 * one.there, one.there))
     if any(isinstance(v, StepWave) for v in clock.velocities):
         return one
     # The way is straight: the state at the root is as good as that at the end.
     _, slope, _ = value_at(points, one.there)
-    sharp = doubt * safe <= STRAIGHT * room * jnp.abs(slope)
+    sharp = doubt * safe <= STRAIGHT_GUARD * room * jnp.abs(slope)
     back = jnp.where(one.once & ~one.cut & sharp, (one.there - 1) * h, one.delta)
     return replace(one, delta=back)
 
@@ -477,7 +481,7 @@ def take_timed_step(
     )
 
 
-def _timed_integrated(rates, osc, lanes: Lanes, new: _Attempt, delta, x1, x2, kept) -> Any:
+def _timed_integrated(rates, osc, lanes: Lanes, new: _TimedAttempt, delta, x1, x2, kept) -> Any:
     """The integrals after a step and the Taylor step behind it."""
     t = lanes.t + new.h
     ends = [(t, new.x1, new.x2), (t + delta, x1, x2)]

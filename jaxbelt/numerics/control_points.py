@@ -22,10 +22,10 @@ from jaxtyping import Array
 #: does.
 TRUSTED = 0.25
 #: Newton steps to a root, or an extremum, from that of the control points.
-NEWTON_STEPS = 3
+ROOT_STEPS = 3
 
 
-class Passage(NamedTuple):
+class RootPassage(NamedTuple):
     """Whether a function that is positive at 0 comes to zero up to 1, arrays of the batch shape.
 
     once: it passes zero once, and is negative at 1; there: where. cut: it may pass zero and come
@@ -75,7 +75,7 @@ def value_at(points: Sequence[Array], theta: Array) -> tuple[Array, Array, Array
     return value, n * slope, n * (n - 1) * (second - first)
 
 
-def passage(points: Sequence[Array], doubt: Array, rounding: Array, trust: Array) -> Passage:
+def passage(points: Sequence[Array], doubt: Array, rounding: Array, trust: Array) -> RootPassage:
     """Whether a function comes to zero, of which a polynomial with these control points is known.
 
     doubt: how far the polynomial may be off inside; its ends are exact up to `rounding`. trust:
@@ -100,7 +100,7 @@ def passage(points: Sequence[Array], doubt: Array, rounding: Array, trust: Array
     root = _first_passage(points, -rounding)
     dips = known & ~below & dip & ~peak & ~stays
     guess = jnp.where(dips, _first_passage([-d for d in steps], rounding), root)
-    theta, lowest = _newton_step(points, guess, dips)
+    theta, lowest = _root_step(points, guess, dips)
     passes = dips & (lowest < -jnp.maximum(doubt, rounding))
     inside = jnp.minimum(theta, 1 - theta) > 1e-3
     splits = dips & ~passes & (lowest <= doubt + rounding) & inside & ~trust
@@ -108,7 +108,7 @@ def passage(points: Sequence[Array], doubt: Array, rounding: Array, trust: Array
     # Newton's method may come to the root at 0 that began the way.
     there = jnp.where(dips, theta, jnp.maximum(theta, 0.1 * root))
     there = jnp.where(passes, jnp.minimum(root, theta), there)
-    return Passage(once, passes | splits | unclear, jnp.where(unclear, 0.5, there))
+    return RootPassage(once, passes | splits | unclear, jnp.where(unclear, 0.5, there))
 
 
 def _first_passage(points: Sequence[Array], level: Array) -> Array:
@@ -122,9 +122,9 @@ def _first_passage(points: Sequence[Array], level: Array) -> Array:
     return jnp.where(points[0] < level, 0.0, found)
 
 
-def _newton_step(points: Sequence[Array], theta: Array, extreme: Array) -> tuple[Array, Array]:
+def _root_step(points: Sequence[Array], theta: Array, extreme: Array) -> tuple[Array, Array]:
     """The root near theta, in [0, 1], or the extremum, and the value there."""
-    for _ in range(NEWTON_STEPS):
+    for _ in range(ROOT_STEPS):
         value, slope, bend = value_at(points, theta)
         over, under = jnp.where(extreme, slope, value), jnp.where(extreme, bend, slope)
         moved = theta - over / jnp.where(under == 0, 1.0, under)

@@ -13,7 +13,7 @@ from ..tables import require_single
 from .style import BELT_COLOURS, new_axes
 
 #: Points of a curve, for each period of the forcing.
-SAMPLES = 257
+SAMPLES_OF_PERIOD = 257
 
 
 def plot_motion(motion: PeriodicMotion, ax: Axes | None = None) -> Axes:
@@ -23,7 +23,7 @@ def plot_motion(motion: PeriodicMotion, ax: Axes | None = None) -> Axes:
     status = Status(int(motion.status))
     require(status == Status.OK, "motion", "one with status OK, to be drawn", status.name)
     ax = new_axes() if ax is None else ax
-    states = np.asarray(motion.sample(SAMPLES * motion.periods))
+    states = np.asarray(motion.sample(SAMPLES_OF_PERIOD * motion.periods))
     style = "-" if bool(motion.stable) else "--"
     ax.plot(*states.T, color="black", linestyle=style, linewidth=1.2)
     ax.plot(*np.asarray(motion.starts).T, "o", color="black", markersize=4, label="phase 0")

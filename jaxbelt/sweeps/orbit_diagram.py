@@ -58,7 +58,7 @@ OUTSIDE = 1e-4
 
 #: Of a forced oscillator: periods that are left out at first, points that are kept, and by how much
 #: they may differ, over their size, to be those of a periodic motion.
-LEFT_OUT, STROBES = 300, 64
+PERIODS_LEFT_OUT, STROBES = 300, 64
 SAME = 1e-6
 
 
@@ -265,11 +265,11 @@ class Sampling:
         )
 
     def _strobed(self, grid: Grid, values: np.ndarray, shape: tuple[int, int]) -> OrbitDiagram:
-        """The diagram of a stroboscopic section: STROBES points behind LEFT_OUT periods."""
+        """The diagram of a stroboscopic section: STROBES points behind PERIODS_LEFT_OUT periods."""
         first = [float(frequencies(self._make(value))[0]) for value in values]
         period = 2 * np.pi / np.repeat(first, shape[1])
-        t1 = float(np.max(period)) * (LEFT_OUT + STROBES + 1)
-        observer = Along(_Strobes((self.at,), LEFT_OUT, STROBES))
+        t1 = float(np.max(period)) * (PERIODS_LEFT_OUT + STROBES + 1)
+        observer = Along(_Strobes((self.at,), PERIODS_LEFT_OUT, STROBES))
         states = np.tile(self.starts.T, len(values))
         found = self._results(grid, observer, states, t1, t0=0.0)
         pieces = [f" {i}" for i in range(STROBES // 8)]
