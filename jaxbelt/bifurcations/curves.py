@@ -278,9 +278,7 @@ def follow_point(
     ahead = _side(problem, point, start, 1.0)
     closed = ahead.end is Stop.CLOSED
     behind = (
-        _SideOfCurve(ahead.rows[:1], [], Stop.CLOSED)
-        if closed
-        else _side(problem, point, start, -1.0)
+        _OneSide(ahead.rows[:1], [], Stop.CLOSED) if closed else _side(problem, point, start, -1.0)
     )
     rows = [*reversed(behind.rows[1:]), *ahead.rows]
     return BifurcationCurve(
@@ -322,15 +320,13 @@ class _Row(NamedTuple):
     place: np.ndarray
 
 
-class _SideOfCurve(NamedTuple):
+class _OneSide(NamedTuple):
     rows: list[_Row]
     special: list[SpecialPoint]
     end: Stop
 
 
-def _side(
-    problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: float
-) -> _SideOfCurve:
+def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: float) -> _OneSide:
     """The curve to one side of a point: leg by leg, each with one signature and one mesh."""
     track, u = Track.begun(problem.variation, point, start)
     origin, direction = u[-2:], sign * track.tangent(u)
@@ -344,9 +340,9 @@ def _side(
         last = points[-1][0].u if points else u
         if end is not Stop.LEFT_SPAN and (limit := _limit(problem, track, rows, last, end)):
             rows += _towards(problem, rows[-1].values, limit)
-            return _SideOfCurve(rows, [*special, limit], Stop.STOPPED)
+            return _OneSide(rows, [*special, limit], Stop.STOPPED)
         if end is not Stop.LEFT_SPAN and (creeping := _end_at_rest(problem, rows, CREEPS)):
-            return _SideOfCurve(rows, [*special, creeping], Stop.STOPPED)
+            return _OneSide(rows, [*special, creeping], Stop.STOPPED)
         if len(rows) >= problem.max_points or not points:
             why = Stop.POINT_COUNT if points else Stop.STEP_TOO_SMALL
             return _ended(problem, rows, special, why)
@@ -371,9 +367,9 @@ def _side(
 
 def _ended(
     problem: _Problem, rows: list[_Row], special: list[SpecialPoint], end: Stop = Stop.STOPPED
-) -> _SideOfCurve:
+) -> _OneSide:
     if end in (Stop.LEFT_SPAN, Stop.CLOSED):
-        return _SideOfCurve(rows, special, end)
+        return _OneSide(rows, special, end)
     limit = _end_at_rest(problem, rows, 2 * problem.step)
     if limit is None and end is Stop.STEP_TOO_SMALL:
         last = [np.stack(column) for column in zip(*((row.values, row.place) for row in rows[-2:]))]
@@ -381,7 +377,7 @@ def _ended(
     known = [one.values for one in special if limit and one.kind == limit.kind]
     apart = [np.hypot(*np.subtract(limit.values, one)) for one in known] if limit else [0.0]
     named = [] if min(apart, default=np.inf) < problem.step else [limit]
-    return _SideOfCurve(rows, [*special, *filter(None, named)], end)
+    return _OneSide(rows, [*special, *filter(None, named)], end)
 
 
 def _end_at_rest(problem: _Problem, rows: list[_Row], near: float) -> SpecialPoint | None:

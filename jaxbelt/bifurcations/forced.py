@@ -284,7 +284,7 @@ class AbstractForcedCondition(AbstractCondition):
 
     ends_at_contact: ClassVar[bool] = True
 
-    def kind_along(self, osc, multiplier):
+    def kind_along(self, osc, multiplier) -> type[AbstractCondition]:
         return type(self)
 
     def check(self, osc):
@@ -492,7 +492,7 @@ class TimedGrazing(AbstractForcedCondition):
     belt: int
     public: type[AbstractCondition] = eqx.field(static=True)
 
-    def kind_along(self, osc, multiplier):
+    def kind_along(self, osc, multiplier) -> type[AbstractCondition]:
         return self.public
 
     def beginnings_of(self, osc, motion, known=False):
@@ -572,7 +572,7 @@ class TimedCrossing(_AtArrival):
 
     rises: ClassVar[float] = 1.0
 
-    def kind_along(self, osc, multiplier):
+    def kind_along(self, osc, multiplier) -> type[AbstractCondition]:
         return self.public
 
 
