@@ -129,7 +129,8 @@ def in_own_units(osc: Oscillator, unit: Any = None) -> OwnOscillator:
     omega: Any = np.asarray(osc.omega) if known else osc.omega
     if known and bool(length == 1) and bool(omega == 1):
         return _unchecked(OwnOscillator, **vars(osc), units=_units_of_one())
-    units = _known_units(length, omega * length) if known else OwnUnits(length, omega * length)
+    velocity = omega * length
+    units = _known_units(length, velocity) if known else OwnUnits(jnp.asarray(length), velocity)
     fields = dict(damping=osc.damping, belts=_scaled(osc.belts, units), omega=jnp.ones(()))
     return _unchecked(OwnOscillator, **fields, units=units)
 
