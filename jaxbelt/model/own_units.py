@@ -141,7 +141,8 @@ def in_own_units(osc: Oscillator, unit: Any = None, *, edges: bool | None = None
     if known and bool(length == 1) and bool(omega == 1):
         own = _unchecked(OwnOscillator, **vars(osc), units=_units_of_one())
         return own if edges else without_edges(own)
-    units = _known_units(length, omega * length) if known else OwnUnits(length, omega * length)
+    velocity = omega * length
+    units = _known_units(length, velocity) if known else OwnUnits(jnp.asarray(length), velocity)
     fields = dict(damping=osc.damping, belts=_scaled(osc.belts, units), omega=jnp.ones(()))
     forcing = _scaled_forces(osc.forcing, units)
     own = _unchecked(OwnOscillator, **fields, forcing=forcing, units=units)
