@@ -33,7 +33,7 @@ from ..checks import check_belt, is_concrete, number, require, require_value
 from ..cycles.attractors import PLACE_DIMENSIONS, place_of
 from ..cycles.chains import SIZES, Chain, Loop
 from ..cycles.cycle import Cycle
-from ..model.oscillator import Oscillator
+from ..model.oscillator import Oscillator, has_clock
 from ..model.own_units import in_own_units, quantity, rescaled
 from ..model.variations import Family, Variation
 from ..motion.arcs import Ends
@@ -171,6 +171,10 @@ class AbstractCondition(eqx.Module):
         told = f"{type(self).__name__} is for oscillators that do not know the time"
         other = "use a condition for forced ones, such as jb.PeriodDoubling()"
         require(False, "osc", f"without a clock: {told}; {other}", "one with forcing")
+
+    def applied_to(self, osc: Oscillator) -> Any:
+        """The condition as the class that solves it for that oscillator."""
+        return self.with_clock() if has_clock(osc) else self
 
     def as_data(self) -> Any:
         """The same condition with arrays for its numbers, as compiled programs take it."""
@@ -408,7 +412,7 @@ class BifurcationPoint(eqx.Module):
         point was found.
         """
         require_single(self, self.value, 0)
-        return self.condition.type_of(self._own) if int(self.status) == Status.OK else ""
+        return self._solved.type_of(self._own) if int(self.status) == Status.OK else ""
 
     @property
     def coefficient(self) -> Array:
@@ -419,18 +423,22 @@ class BifurcationPoint(eqx.Module):
         point there is a cycle with r^2 = -rate/a, which attracts where a < 0. NaN for other kinds,
         and at a fixed point on a contact edge.
         """
-        found = self._back(self.condition.coefficient(self._own), "coefficient")
+        found = self._back(self._solved.coefficient(self._own), "coefficient")
         return jnp.where(self.status == Status.OK, found, jnp.nan)
+
+    @property
+    def _solved(self) -> AbstractCondition:
+        return self.condition.applied_to(self._own.oscillator)
 
     @property
     def place(self) -> np.ndarray:
         """Place of the motion, see `place_of`; NaN where there is none."""
-        return self._back(self.condition.place(self._own), *PLACE_DIMENSIONS)
+        return self._back(self._solved.place(self._own), *PLACE_DIMENSIONS)
 
     @property
     def orbit(self) -> np.ndarray | None:
         """States of the motion at a point that is no cycle, [samples, 2]; None if there is none."""
-        states = self.condition.orbit(self._own)
+        states = self._solved.orbit(self._own)
         return None if states is None else self._back(states, "length", "velocity")
 
     def row(self) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from ..checks import (
     require_value,
 )
 from ..cycles.attractors import PLACE_DIMENSIONS, distance
-from ..model.oscillator import Oscillator, has_clock
+from ..model.oscillator import Oscillator
 from ..model.own_units import own_length, quantity, rescaled
 from ..model.parameters import leaf_index
 from ..model.variations import Variation
@@ -270,9 +270,7 @@ def follow_point(
     """
     units = np.asarray(variation.family(start).units)
     measured, ends = variation.measured_in(units), limits / units[:, None]
-    condition = point.condition
-    if has_clock(point.oscillator):
-        condition = condition.with_clock()
+    condition = point.condition.applied_to(point.oscillator)
     problem = _Problem(condition, measured, ends, step, max_points)
     start = start / units
     ahead = _side(problem, point, start, 1.0)

@@ -251,7 +251,7 @@ class ArcRows(NamedTuple):
         parts = motion.chain.codes, motion.chain.ends, motion.unknowns
         return cls(*(np.asarray(part)[used] for part in parts))
 
-    def put(self, first: int, last: int, *rows: tuple[Any, int, Any]) -> "ArcRows":
+    def put(self, first: int, last: int, *rows: tuple[Any, Any, Any]) -> "ArcRows":
         """With (codes, end, unknowns) in place of the arcs from the first up to the last one."""
         new = [np.array(list(column)) for column in zip(*rows, strict=True)]
         parts = [

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from ..model.oscillator import Oscillator, has_clock
+from ..model.oscillator import Oscillator
 from ..model.variations import Family, Variation
 from ..numerics.compiling import jit
 from ..numerics.continuation import Corrected, CurvePoint, corrected
@@ -42,10 +42,7 @@ class Track(NamedTuple):
         cls, variation: Variation, point: BifurcationPoint, pair: np.ndarray
     ) -> tuple["Track", np.ndarray]:
         """The system to follow from a point, and u there; pair: both parameters."""
-        condition = point.condition
-        if has_clock(point.oscillator):
-            condition = condition.with_clock()
-        system, x = condition.system_at(point)
+        system, x = point.condition.applied_to(point.oscillator).system_at(point)
         weights = system.weights(jnp.asarray(x))
         u = np.append(np.asarray(weights) * np.asarray(x).reshape(-1), pair)
         return cls(variation, system, weights), u
