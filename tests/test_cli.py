@@ -120,7 +120,7 @@ def test_a_tolerance_that_is_given_is_a_length_in_the_users_unit(given):
 @pytest.mark.parametrize("system", ["a", "b", "c", "d", OWN])
 def test_parameters_are_those_of_the_oscillator(system):
     """Told without the oscillator, before anything that computes is imported."""
-    described = Description(system) if system in list("abcd") else Description(belt=system)
+    described = Description(system) if system in list("abcd") else Description(belt=[*system])
     osc, known = described.oscillator(), described.parameters()
     assert set(known.values()) == set(names_of(osc))
     assert [name for name in known if known[name] != name] == [
@@ -132,7 +132,7 @@ def test_parameters_are_those_of_the_oscillator(system):
 def test_axes_by_name():
     """Of a class its arguments, then anything by its path; dataset.attrs["call"] can be run."""
     axes = {"nu0": 0.2, "belts[1].load": 0.7}
-    make = Description(belt=OWN, damping=0.4, omega=1.1).along(axes)
+    make = Description(belt=[*OWN], damping=0.4, omega=1.1).along(axes)
     assert repr(make(**axes)) == repr(own(0.2, 0.7))
     assert repr(make(damping=0.3, nu0=0.2)) == repr(make(zeta=0.3, nu0=0.2))
     assert float(make(zeta=0.3).damping) == 0.3

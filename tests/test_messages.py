@@ -58,13 +58,31 @@ def test_every_public_function_and_class_that_takes_arguments_is_among_the_mista
         "Cycle",
         "Design",
         "Equilibria",
+        "Exponents",
         "Events",
         "Explanation",
         "Fit",
     }
-    results |= {"FatalShock", "OrbitDiagram", "Portrait", "RegionMap", "Separatrix", "SpecialPoint"}
+    results |= {
+        "FatalShock",
+        "OrbitDiagram",
+        "PeriodicMotion",
+        "Portrait",
+        "RegionMap",
+        "Separatrix",
+        "SpecialPoint",
+    }
     results |= {"Trajectory", "Verified"}
-    results |= {"AbstractFriction", "AtEvents", "EquilibriumKind", "EventKind", "Status"}
+    results |= {
+        "AbstractForce",
+        "AbstractFriction",
+        "AtEvents",
+        "PeriodDoubling",
+        "Torus",
+        "EquilibriumKind",
+        "EventKind",
+        "Status",
+    }
     results |= {"presets"}
     assert set(jb.__all__) - called - results == set()
 

@@ -124,7 +124,7 @@ def is_same(cycle: Cycle, other: Cycle) -> bool:
     if int(cycle.status) != Status.OK or int(other.status) != Status.OK:
         return False
     modes, others = (itinerary(one.oscillator, one) for one in (cycle, other))
-    return modes == others and distance(place_of(cycle), place_of(other)) < SAME_CYCLE
+    return modes == others and bool(distance(place_of(cycle), place_of(other)) < SAME_CYCLE)
 
 
 def distinct(cycles: Sequence[Cycle]) -> list[Cycle]:

@@ -72,8 +72,8 @@ class Grid:
         require(is_concrete(self.example), "make", known, "a traced one")
         check_scalars(self.example)
         self.edges = True
-        self.mapped = traceable(self._varying, "make", returns)
         own = in_units_of_run(self.example, edges=True)
+        self.mapped = traceable(self._varying, "make", returns)
         alike = len(self.mapped) == len(jax.tree.leaves(own))
         expected = "frequencies other than 0, which make a constant force"
         require(alike, "axes", expected, "0 as the first value of one")
