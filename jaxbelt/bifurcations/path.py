@@ -456,7 +456,7 @@ def _gone_on(osc: Oscillator, beside: Cycle) -> Cycle | None:
 
 def _is_beside(cycle: Cycle, other: Cycle) -> bool:
     """Whether another cycle is found, and so near that one goes on to the other."""
-    return _is_found(other) and distance(place_of(cycle), place_of(other)) < GOES_ON
+    return _is_found(other) and bool(distance(place_of(cycle), place_of(other)) < GOES_ON)
 
 
 def _width(cycle: Cycle) -> float:

@@ -6,7 +6,7 @@ Newton's method solves for the shortest way (see `Meeting`) between those pairs 
 that these bounds leave.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -173,7 +173,7 @@ def shortest_between(
     return best, end, Meeting(*jax.device_put(where))
 
 
-def _tries_of(one: Sampled, other: Sampled, along_x2: bool) -> tuple[np.ndarray, ...]:
+def _tries_of(one: Sampled, other: Sampled, along_x2: bool) -> tuple[Any, ...]:
     """Guesses for Newton's method, likely ones first.
 
     Returns the parts of both curves, fractions, and which are fixed, [n, 2] each; lower bounds of

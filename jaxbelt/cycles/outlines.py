@@ -147,9 +147,9 @@ def jumps(osc: Oscillator, belt: Array) -> tuple[Array, Array, Array]:
     kinetic = jnp.abs(mode_acceleration(osc, slips, zero, v) - middle)
     held = capacity(osc, stuck)
     exists = (jnp.stack(stuck.codes)[belt] == STUCK) & (held - kinetic > force_rounding(middle))
-    lower = jnp.clip(jnp.stack([middle - held, middle + kinetic]), low, high)
-    upper = jnp.clip(jnp.stack([middle - kinetic, middle + held]), low, high)
-    there = exists & (lower < upper)
+    lower = jnp.clip(jnp.stack([middle - held, middle + kinetic]), low[None], high[None])
+    upper = jnp.clip(jnp.stack([middle - kinetic, middle + held]), low[None], high[None])
+    there = exists[None] & (lower < upper)
     lower, upper = (jnp.where(there, x1, jnp.nan).reshape(-1) for x1 in (lower, upper))
     return lower, upper, v
 
