@@ -17,10 +17,10 @@ from tests.campaign import forced, forced_cases
 OK = jb.Status.OK
 
 
-def bkn(frequency):
+def bkn(frequency, amplitude=0.1):
     """The oscillator of di Bernardo, Kowalczyk and Nordmark, 2003."""
     law = jb.Cubic(1.5, 1.5, 0.45)
-    return jb.Oscillator(0.0, (jb.Belt(1.0, law),), forcing=jb.Harmonic(0.1, frequency))
+    return jb.Oscillator(0.0, (jb.Belt(1.0, law),), forcing=jb.Harmonic(amplitude, frequency))
 
 
 def bkn_of_engine(frequency):
@@ -121,6 +121,23 @@ def test_grazing_of_the_motion_of_four_periods(smooth):
     wanted = [0.840725392543, 0.00719233612]
     assert point.cycle.multipliers.real == pytest.approx(wanted, abs=1e-9)
     assert point.kind == "GrazingSliding" and len(point.table()) == 1
+
+
+@pytest.mark.slow
+def test_a_curve_of_grazing_is_what_refine_finds(smooth):
+    point = jb.refine(jb.GrazingSliding(0), bkn(1.7079), where=frequency_of, start=smooth)
+    both = frequency_of, lambda osc: osc.forcing[0].amplitude
+    curve = jb.bifurcation_curve(point, both, ((1.69, 1.72), (0.08, 0.12)), max_points=30)
+    assert len(curve) > 4 and np.all(curve.residual < 1e-11)
+    np.testing.assert_allclose(curve.values[[0, -1], 0], [1.69, 1.72], rtol=0, atol=1e-12)
+    row = int(np.argmin(np.abs(curve.values[:, 0] - 1.7079))) + 1
+    frequency, amplitude = curve.values[row]
+    beside = bkn(frequency + 1e-5, amplitude)
+    near = jb.periodic(beside, np.asarray(smooth.start), periods=4)
+    assert int(near.status) == OK
+    again = jb.refine(jb.GrazingSliding(0), beside, where=frequency_of, start=near)
+    assert float(again.value) == pytest.approx(frequency, abs=1e-10)
+    assert again.place == pytest.approx(curve.places[row], abs=1e-6)
 
 
 def test_fold_of_the_sticking_motion(sticking):

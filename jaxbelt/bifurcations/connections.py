@@ -118,7 +118,7 @@ class Connection(CycleSystem):
         positions = jnp.stack(edges(osc))
         return positions[self.leaves] == positions[self.arrives]
 
-    def place(self, x):
+    def place(self, osc, x):
         # The state at its end, too.
         used = np.asarray(self.chain.used)
         return extent(np.concatenate([x[used], x[-1:]]))
@@ -222,7 +222,7 @@ class SaddleConnection(AbstractCondition):
 
     def place(self, point):
         system, x = self.system_at(point)
-        return system.place(np.asarray(x))
+        return system.place(point.oscillator, np.asarray(x))
 
     def orbit(self, point):
         system, x = self.system_at(point)

@@ -127,11 +127,10 @@ class TimedSystem(AbstractSystem):
         exists = (motion.status == Status.OK) & (self.judge(osc, motion) == Status.OK)
         return Seen({}, exists, jnp.real(motion.multipliers[0]), error)
 
-    def place(self, x):
-        used = np.asarray(self.chain.used)
-        states = np.asarray(x)[used]
-        ends = np.min(states[:, :2], axis=0), np.max(states[:, :2], axis=0)
-        return np.array([ends[0][0], ends[1][0], ends[0][1], ends[1][1], np.sum(states[:, 3])])
+    def place(self, osc, x):
+        none = jnp.full(2, jnp.nan, complex)
+        numbers = jnp.zeros(()), jnp.asarray(0), jnp.asarray(Status.OK.value)
+        return place_of_motion(PeriodicMotion(osc, self.chain, jnp.asarray(x), none, *numbers))
 
     def shaped(self, x):
         return x.reshape(-1, 4)
@@ -141,7 +140,9 @@ class TimedSystem(AbstractSystem):
 
     def remeshed(self, osc, x):
         loop = Loop(self.chain.codes, self.chain.ends, x[:, :3], x[:, 3])
-        chain, _ = timed_chain(osc, loop, least_steps(osc, loop), self.chain.turns)
+        # The mesh has been refined, and will be once more.
+        size = self.chain.mesh.shape[-1] // PARTS_OF_ARC
+        chain, _ = timed_chain(osc, loop, size, self.chain.turns)
         return eqx.tree_at(lambda system: system.chain, self, chain).refined(osc, x)
 
     def refined(self, osc: Oscillator, x: Array) -> "TimedSystem":

@@ -81,7 +81,7 @@ class AbstractSystem(eqx.Module):
         """What is seen at a solution x."""
 
     @abc.abstractmethod
-    def place(self, x: np.ndarray) -> np.ndarray:
+    def place(self, osc: Oscillator, x: np.ndarray) -> np.ndarray:
         """Place of the motion, as `attractors.place_of`; NaN where it is not to be compared."""
 
     @abc.abstractmethod
@@ -146,7 +146,7 @@ class RestSystem(AbstractSystem):
         error = jnp.max(jnp.abs(self.residual(osc, x)))
         return Seen(tests, self.exists(osc, x), jnp.asarray(jnp.nan), error)
 
-    def place(self, x):
+    def place(self, osc, x):
         return NOWHERE
 
     def shaped(self, x):
@@ -233,7 +233,7 @@ class CycleSystem(AbstractSystem):
         exists = (cycle.status == Status.OK) & (error < HOLDS) & is_meant
         return Seen({**velocity_tests(osc), **tests}, exists, multiplier, error)
 
-    def place(self, x):
+    def place(self, osc, x):
         return extent(x[np.asarray(self.chain.used)])
 
     def shaped(self, x):

@@ -69,7 +69,7 @@ class Track(NamedTuple):
 
     def place(self, u: np.ndarray) -> np.ndarray:
         """Place of the motion, see `place_of`."""
-        return self.system.place(self.unknowns(u))
+        return self.system.place(self.variation.oscillator(u[-2:]), self.unknowns(u))
 
     def seen_at(self, u: np.ndarray) -> Seen:
         """What is seen at a solution, in numbers."""
