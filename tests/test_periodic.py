@@ -123,6 +123,50 @@ def test_grazing_of_the_motion_of_four_periods(smooth):
     assert point.kind == "GrazingSliding" and len(point.table()) == 1
 
 
+def on_a_belt(nu, frequency, damping, amplitude, package):
+    """One belt with Coulomb's friction and a harmonic force, of the package or of the engine."""
+    if package is jb:
+        belts = (jb.Belt(nu, jb.Coulomb(1.0, 0.6)),)
+        return jb.Oscillator(damping, belts, forcing=jb.Harmonic(amplitude, frequency))
+    belts = (forced.Belt(nu, ("coulomb", 1.0, 0.6)),)
+    return forced.Oscillator(damping, belts, (forced.Harmonic(amplitude, frequency),))
+
+
+@pytest.mark.parametrize(
+    ("condition", "numbers", "guess"),
+    [
+        (jb.AddingSliding(0), (0.1, 1.5, 0.05), 0.95),
+        (jb.CrossingSliding(0), (0.1, 1.5, 0.05), 1.0),
+        (jb.CrossingSliding(0), (0.1, 1.5, 0.05), 1.1),
+        (jb.SwitchingSliding(0), (0.9, 1.3, 0.05), 0.9),
+        (jb.GrazingSliding(0), (0.5, 2.25, 0.15), 1.1),
+    ],
+)
+def test_sliding_points_are_where_the_motion_of_the_engine_changes(condition, numbers, guess):
+    """Found by halving an interval, at whose ends the motions have different events."""
+    motion = jb.find_cycle(on_a_belt(*numbers, guess, jb), (1.0, 0.0))
+    point = jb.refine(
+        condition,
+        on_a_belt(*numbers, guess, jb),
+        where=lambda osc: osc.forcing[0].amplitude,
+        start=motion,
+    )
+    assert int(point.status) == OK
+
+    def events(amplitude):
+        osc = on_a_belt(*numbers, amplitude, forced)
+        settled = forced_cases.stroboscopic(osc, np.asarray(point.cycle.start), 400).y_end
+        return forced_cases.stroboscopic(osc, settled, point.cycle.periods).sequence
+
+    low, high = float(point.value) - 1e-3, float(point.value) + 1e-3
+    before = events(low)
+    assert events(high) != before
+    while high - low > 1e-11:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if events(middle) == before else (low, middle)
+    assert float(point.value) == pytest.approx(low, abs=1e-10)
+
+
 @pytest.mark.slow
 def test_a_curve_of_grazing_is_what_refine_finds(smooth):
     point = jb.refine(jb.GrazingSliding(0), bkn(1.7079), where=frequency_of, start=smooth)
