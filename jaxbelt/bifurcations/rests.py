@@ -227,7 +227,7 @@ class HopfSystem(RestSystem):
             ("BoundaryHopf", ()): jnp.where(jnp.isfinite(nearest), nearest, jnp.nan),
         }
 
-    def place(self, x):
+    def place(self, osc, x):
         return np.array([x[0], x[0], 0.0, 0.0, 0.0])
 
 
