@@ -61,7 +61,7 @@ from .si import in_si
 from .sweeps.basins import Basins, BasinStability, basin_stability, basins
 from .sweeps.datasets import decoded
 from .sweeps.fractions import BasinFractions, basin_fractions
-from .sweeps.moments import AtEvents, AtExtrema, AtSection, AtTimes
+from .sweeps.moments import AtEvents, AtExtrema, AtPhase, AtSection, AtTimes
 from .sweeps.orbit_diagram import OrbitDiagram, orbit_diagram
 from .sweeps.shares import attractors
 from .sweeps.store import Verified, verify
@@ -81,6 +81,7 @@ __all__ = [
     "Arcs",
     "AtEvents",
     "AtExtrema",
+    "AtPhase",
     "AtSection",
     "AtTimes",
     "BaseMotion",

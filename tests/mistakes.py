@@ -434,6 +434,7 @@ MISTAKES = [
     ("jb.attractors({'kind': 3})", r"dataset must be an xarray.Dataset, .*, got \{'kind': 3\}"),
     ("jb.AtExtrema('x3')", 'of must be "x1" or "x2", got \'x3\''),
     ("jb.AtSection('x1')", "function must be a function of osc, x1 and x2, got 'x1'"),
+    ("jb.AtPhase(math.nan)", "phase must be a finite angle, got nan"),
     ("jb.AtTimes([3.0, 1.0])", r"times must be .*increasing, got \[3\. 1\.\]"),
     ("jb.basins(osc, x1=(0, 3), x2=(-1, 1))", r"x1 must be .*linspace\(0, 3, 201\), got \(0, 3\)"),
     ("jb.basins(osc, x1=(1, 0), x2=(0, 1))", r"x1 .*linspace\(0, 1, 201\), got \(1, 0\)$"),

@@ -30,7 +30,7 @@ PAGES = {
 }
 #: What these compile, few other tests need.
 SLOW = """
-AtEvents AtExtrema AtSection AtTimes BasinFractions BasinStability Basins-class BeltAtRest
+AtEvents AtExtrema AtPhase AtSection AtTimes BasinFractions BasinStability Basins-class BeltAtRest
 BifurcationCurve BifurcationDiagram BoundaryEquilibrium CornerCollision CrossingSliding Design-class
 EdgeExchange FatalShock Fit-class FoldOfCycles GrazingEdge MeetingEdges OrbitDiagram Portrait-class
 PseudoHopf RegionMap SaddleConnection Separatrix SpecialPoint

@@ -1,5 +1,6 @@
 """Sweeps of forced oscillators, against the engine of `campaign/forced.py`."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -64,3 +65,75 @@ def test_what_is_impossible_is_refused(options, message):
 def test_a_start_time_is_for_those_that_know_the_time():
     with pytest.raises(ValueError, match="t0"):
         jb.sweep(jb.presets.class_a, {"nu0": np.array([0.2])}, t0=1.0, t1=10.0)
+
+
+# --- moments --------------------------------------------------------------------------------------
+
+
+class Rows:
+    """Time, state and number of every moment, in their order."""
+
+    def __init__(self, at, room=40):
+        self.at, self.room = at, room
+
+    def init(self, osc, x1, x2):
+        return jnp.full((self.room, 4), jnp.nan), jnp.zeros((), int)
+
+    def update(self, state, event):
+        rows, count = state
+        row = jnp.stack([event.t, event.x1, event.x2, event.moment.astype(float)])
+        return jnp.where((jnp.arange(self.room) == count)[:, None], row[None], rows), count + 1
+
+    def finish(self, state, end):
+        return {"rows": state[0].reshape(-1), "moments": state[1]}
+
+
+def _two_belts(amplitude, frequency):
+    first = jb.Belt(0.4, jb.Coulomb(1.0, 0.6))
+    second = jb.Belt(0.8, jb.Coulomb(0.5, 0.5), 0.5, lower=0.2)
+    return jb.Oscillator(0.05, (first, second), forcing=jb.Harmonic(amplitude, frequency))
+
+
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("t0", [0.0, 2.0])
+def test_moments_are_those_of_a_run_that_is_sampled(t0):
+    times = (0.0, 1.0, 2.5, 7.0)
+    section = jb.AtSection(lambda osc, x1, x2: x1 - 0.3)
+    at = (jb.AtPhase(0.5), jb.AtExtrema("x1"), section, jb.AtTimes(times))
+    axes = {"amplitude": np.array([0.3, 1.0, 1.5]), "frequency": np.array([0.5, 1.0, 1.7])}
+    options = dict(y0=(1.0, 0.0), t0=t0, t1=20.0, rtol=1e-10, atol=1e-10)
+    swept = jb.sweep(_two_belts, axes, observe=Rows(at), progress=False, **options)
+    even = np.linspace(t0, 20.0, 20_001)
+    for amplitude in axes["amplitude"]:
+        for frequency in axes["frequency"]:
+            one = swept.sel(amplitude=amplitude, frequency=frequency)
+            assert int(one.status) == jb.Status.OK
+            rows = one.rows.values.reshape(-1, 4)[: int(one.moments)]
+            t, number = rows[:, 0], rows[:, 3]
+            assert np.all(np.diff(t) >= 0)
+            osc = _two_belts(amplitude, frequency)
+            ts, places = np.unique(np.concatenate([t, even]), return_inverse=True)
+            run = jb.simulate(osc, (1.0, 0.0), 20.0, t0=t0, ts=ts)
+            states = np.asarray(run.ys)[places]
+            np.testing.assert_allclose(states[: len(t)], rows[:, 1:3], atol=1e-8)
+            x1, x2 = states[len(t) :].T
+            phases = (0.5 + 2 * np.pi * np.arange(20)) / frequency
+            np.testing.assert_allclose(t[number == 0], phases[(phases >= t0) & (phases <= 20.0)])
+            # It begins at an extremum, which is none that it comes to.
+            assert np.sum(number == 1) == np.sum(np.diff(np.sign(x2[1:])) != 0)
+            assert np.sum(number == 2) == np.sum(np.diff(np.sign(x1 - 0.3)) != 0)
+            assert t[number == 3].tolist() == [one for one in times if one >= t0]
+
+
+@pytest.mark.slow(first=True)
+def test_an_orbit_diagram_has_the_periods_of_find_cycle():
+    diagram = jb.orbit_diagram(jb.presets.di_bernardo, span=(1.67, 1.75), y0=(0.5, 0.0), rows=9)
+    for value, kind, period, x1 in zip(*(diagram.values, diagram.kind, diagram.period, diagram.x1)):
+        motion = jb.find_cycle(jb.presets.di_bernardo(value), (0.5, 0.0))
+        if int(motion.status) != jb.Status.OK:
+            assert kind[0] == "no period found"
+            continue
+        assert kind[0] == "cycle" and period[0] == pytest.approx(float(motion.period))
+        points = np.sort(x1[0][np.isfinite(x1[0])])
+        np.testing.assert_allclose(points, np.sort(motion.starts[:, 0]), atol=1e-5)
+    assert {"cycle", "no period found"} == set(diagram.kind.ravel().tolist())

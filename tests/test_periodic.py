@@ -54,6 +54,17 @@ def test_find_cycle_finds_the_number_of_periods(smooth, sticking):
     assert float(smooth.stick_durations[0]) == 0.0
 
 
+@pytest.mark.parametrize("frequency", [1.715, 1.725, 1.8])
+def test_the_number_of_periods_is_the_least(frequency):
+    motion = jb.find_cycle(bkn(frequency), (0.5, 0.0))
+    assert motion.periods == 2
+    start = np.asarray(motion.start)
+    once, twice = (
+        forced_cases.stroboscopic(bkn_of_engine(frequency), start, n).y_end for n in (1, 2)
+    )
+    assert np.max(np.abs(start - once)) > 0.1 and start == pytest.approx(twice, abs=1e-9)
+
+
 def test_motions_and_multipliers_are_those_of_the_engine(smooth, sticking):
     # Differences of runs at 1e-13; the state is 3e-5 from grazing, so the step is small.
     for motion, frequency, h in ((smooth, 1.7079, 1e-6), (sticking, 1.68, 1e-4)):

@@ -31,7 +31,7 @@ NO_RESULTS = {
     *(jb.Cubic, jb.AbstractForce, jb.Harmonic, jb.BaseMotion, jb.Oscillating),
     *(jb.Belt, jb.Oscillator),
     *(jb.Machine, jb.PhysicalBelt, jb.Units),
-    *(jb.AtEvents, jb.AtExtrema, jb.AtSection, jb.AtTimes),
+    *(jb.AtEvents, jb.AtExtrema, jb.AtPhase, jb.AtSection, jb.AtTimes),
     *(jb.EquilibriumKind, jb.EventKind, jb.Status),
     *(jb.BeltAtRest, jb.BoundaryEquilibrium, jb.CornerCollision, jb.CrossingSliding),
     *(jb.EdgeExchange, jb.FoldOfCycles, jb.GrazingEdge, jb.GrazingSliding, jb.Hopf),

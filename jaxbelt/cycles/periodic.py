@@ -536,7 +536,7 @@ def attracted(osc: Oscillator, y0: Any, turns: int) -> PeriodicMotion:
         tried *= 1 + slow
         found = _repeated(osc, followed, HARDLY_BACK if slow else NEARLY_BACK, turns)
         if found is not None:
-            return found
+            return _of_least_periods(osc, found, turns)
         y = after_period(osc, followed)
     return nothing_found(osc, turns, Status.NOT_SETTLED)
 

@@ -8,7 +8,7 @@ from matplotlib.lines import Line2D
 
 from ..checks import require_one_of, require_value
 from ..sweeps.moments import AtExtrema
-from ..sweeps.orbit_diagram import OrbitDiagram
+from ..sweeps.orbit_diagram import NOT_PERIODIC, OrbitDiagram
 from .diagrams import QUANTITIES
 from .style import add_key, figure_of, new_axes, parameter_label
 
@@ -17,6 +17,7 @@ from .style import add_key, figure_of, new_axes, parameter_label
 DOTS: dict[str, dict[str, Any]] = {
     "equilibrium": {"color": "#0072B2", "marker": ".", "label": "equilibrium"},
     "cycle": {"color": "black", "marker": ".", "label": "cycle"},
+    NOT_PERIODIC: {"color": "#666666", "marker": ".", "label": "no period found"},
     "stuck": {"color": "#D55E00", "marker": ".", "label": "stuck for ever"},
     "undecided": {"color": "#CC79A7", "marker": "|", "label": "undecided"},
 }

@@ -18,6 +18,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..checks import as_array, require, require_callable, require_one_of, require_value
+from ..model.forcing import Oscillating
 from ..model.modes import Mode, mode_acceleration, without_rounding
 from ..model.oscillator import Oscillator, frequencies, has_clock
 from .observers import as_given
@@ -108,6 +109,8 @@ class AtPhase:
     Attributes:
         phase: An angle.
 
+    Example:
+        diagram = jb.orbit_diagram(osc, where, (1.6, 1.8), at=jb.AtPhase())
     """
 
     phase: float = 0.0
@@ -119,7 +122,8 @@ class AtPhase:
 
     def next_time(self, osc: Oscillator, passed: Array) -> Array:
         """The time of the moment that so many are before, counted from the turn of t = 0 on."""
-        return (self.phase + 2 * np.pi * passed) / frequencies(osc)[0]
+        frequency = frequencies(osc)[0]
+        return (self.phase + 2 * np.pi * passed.astype(frequency.dtype)) / frequency
 
     def passed_at(self, osc: Oscillator, t: Array, count: Array) -> Array:
         """The number of the first moment at t or later, as numbers like `count`."""
@@ -141,7 +145,10 @@ def checked(at: Any) -> tuple[Any, ...]:
 def check_moments(at: tuple[Any, ...], osc: Oscillator) -> None:
     """Raise a `ValueError` where moments are not for the oscillator."""
     clock = has_clock(osc)
+    steady = not any(isinstance(belt.velocity, Oscillating) for belt in osc.belts)
     for moment in at:
+        told = "AtEvents() alone where the velocity of a belt oscillates"
+        require(steady or isinstance(moment, AtEvents), "at", told, repr(moment))
         if isinstance(moment, AtPhase):
             require(clock, "at", "for an oscillator without forcing no AtPhase", repr(moment))
         if isinstance(moment, AtExtrema) and moment.of == "x2":

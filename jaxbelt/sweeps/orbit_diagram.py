@@ -29,7 +29,7 @@ from ..checks import (
     require_value,
 )
 from ..cycles.attractors import RUN
-from ..model.oscillator import Oscillator, frequencies, refuse_clock
+from ..model.oscillator import Oscillator, frequencies, has_clock
 from ..model.parameters import leaf_index
 from ..model.variations import Variation, as_span, varied
 from ..numerics.spacing import evenly_spaced
@@ -55,11 +55,12 @@ MOST_RUNS = 64
 #: A run through a loop goes on beyond it by this fraction of the period.
 OUTSIDE = 1e-4
 
-
 #: Of a forced oscillator: periods that are left out at first, points that are kept, and by how much
 #: they may differ, over their size, to be those of a periodic motion.
-PERIODS_LEFT_OUT, STROBES = 300, 64
+PERIODS_LEFT_OUT, STROBES = 1000, 64
 SAME = 1e-6
+#: The kind of such points without a period: of chaos, of a torus, or of a slow approach.
+NOT_PERIODIC = "no period found"
 
 
 class OrbitDiagram(eqx.Module):
@@ -68,7 +69,7 @@ class OrbitDiagram(eqx.Module):
     Attributes:
         values: Values of the parameter, increasing, [values].
         kind: Attractor of each start: "equilibrium", "cycle", "stuck" (for ever, to a belt at rest)
-            or "undecided", [values, starts].
+            or "undecided", and with forcing "no period found", [values, starts].
         period: Periods of cycles, else NaN, [values, starts].
         status: A `Status` each, [values, starts].
         x1: Points of the attractors, [values, starts, points], dimensionless, NaN where there are
@@ -144,7 +145,9 @@ class OrbitDiagram(eqx.Module):
 
     def __repr__(self) -> str:
         counts = Counter(self.kind.ravel().tolist())
-        kinds = ", ".join(f"{counts[kind]} {kind}" for kind in KINDS if counts[kind])
+        kinds = ", ".join(
+            f"{counts[kind]} {kind}" for kind in (*KINDS, NOT_PERIODIC) if counts[kind]
+        )
         ends = f"{self.values[0]:.6g} to {self.values[-1]:.6g}"
         return f"OrbitDiagram({self.name} from {ends}, {self.kind.size} runs: {kinds})"
 
@@ -156,7 +159,7 @@ def orbit_diagram(
     where: Callable[[Oscillator], Any] | None = None,
     span: tuple[float, float] | None = None,
     *,
-    at: AtExtrema | AtSection | AtEvents | None = None,
+    at: AtExtrema | AtSection | AtEvents | AtPhase | None = None,
     y0: ArrayLike | Sequence[Any] = (3.0, 0.0),
     rows: int = 400,
     rtol: ArrayLike = 1e-8,
@@ -193,13 +196,16 @@ def orbit_diagram(
     first, last = as_span(span, where)
     starts = _starts_of(y0)
     numbers = {"rtol": as_positive(rtol, "rtol"), "atol": as_tolerance(atol, "atol")}
-    variation = varied(osc, where, (first,))
+    variation = varied(osc, where, (first,), forced=True)
     rows = as_whole(rows, "rows", 2)
     example = variation.oscillator(np.array([first]))
-    refuse_clock(example, "orbit_diagram", "jb.bifurcation_diagram or jb.sweep")
-    at = AtExtrema("x1") if at is None else at
-    kinds = AtExtrema | AtSection | AtEvents
-    require_value(isinstance(at, kinds), "at", "an AtExtrema, AtSection or AtEvents", at)
+    if has_clock(example):
+        at = AtPhase() if at is None else at
+        require_value(isinstance(at, AtPhase), "at", "an AtPhase, as osc is forced", at)
+    else:
+        at = AtExtrema("x1") if at is None else at
+        kinds = AtExtrema | AtSection | AtEvents
+        require_value(isinstance(at, kinds), "at", "an AtExtrema, AtSection or AtEvents", at)
     check_sections((at,), example)
     return Sampling(variation, at, starts, rows, numbers).diagram((first, last))
 
@@ -282,7 +288,8 @@ class Sampling:
         good = (status == Status.OK) | (status == Status.STUCK_FOREVER)
         x1[~good], x2[~good] = np.nan, np.nan
         turns = _turns_in(x1, x2)
-        kind = np.where(turns > 0, "periodic", KINDS[UNDECIDED])
+        kind = np.where(turns > 0, KINDS[CYCLE], NOT_PERIODIC)
+        kind = np.where(good, kind, KINDS[UNDECIDED])
         once = (turns[:, None] > 0) & (np.arange(STROBES) >= turns[:, None])
         x1, x2 = (np.where(once, np.nan, x) for x in (x1, x2))
         return OrbitDiagram(

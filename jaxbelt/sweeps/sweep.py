@@ -86,9 +86,9 @@ def sweep(
       kind, belt); `finish(state, end)` a dictionary of results, numbers or vectors, from the state
       and an `observers.RunEnd` (t, x1, x2, status). They are traced, so use `jax.numpy`. With the
       attribute `at`, a tuple of the moments `AtEvents()`, `AtExtrema("x1")`, `AtSection(function)`,
-      `AtTimes(times)`, not where the oscillators are forced, `update` is called at these; with a
+      `AtTimes(times)` and, with forcing, `AtPhase(phase)`, `update` is called at these; with a
       method `rates(osc, motion)`, which returns a tree of numbers, their integrals are in
-      event.integrals and end.integrals, see `along.Motion`.
+      event.integrals and end.integrals, see `along.Motion`; not with forcing.
     - a `lanes.Observer`, the base class of the first two.
 
     Args:
