@@ -129,6 +129,44 @@ def test_parameters_are_those_of_the_oscillator(system):
     ]
 
 
+def test_forces_are_those_of_the_oscillator():
+    """Also where they vary, and where one is constant."""
+    described = Description("a", force=["0.3,1.7", "0.1,0", "0.2,2,0.5"])
+    osc = described.oscillator(nu0=0.4)
+    forces = jb.Harmonic(0.3, 1.7), jb.Harmonic(0.1, 0.0), jb.Harmonic(0.2, 2.0, 0.5)
+    assert repr(osc) == repr(jb.Oscillator(0.5, jb.presets.class_a(0.4).belts, forcing=forces))
+    assert set(described.parameters().values()) == set(names_of(osc))
+    moved = described.along(["nu0", "forcing[0].frequency"])(**{"forcing[0].frequency": 1.1})
+    assert float(moved.forcing[0].frequency) == 1.1
+
+
+@pytest.mark.parametrize(
+    ("force", "message"),
+    [
+        ("0.3", "force must be AMPLITUDE,FREQUENCY or .*, numbers, got '0.3'"),
+        ("0.3,one", "force must be AMPLITUDE,FREQUENCY or .*, numbers, got '0.3,one'"),
+        ("0.3,-1", "force must be finite numbers with a frequency >= 0, got '0.3,-1'"),
+        ("nan,1", "force must be finite numbers with a frequency >= 0, got 'nan,1'"),
+    ],
+)
+def test_bad_forces_are_told(force, message):
+    with pytest.raises(ValueError, match=message):
+        Description(force=[force]).check()
+
+
+def test_a_forced_run_is_written(tmp_path):
+    belt = ["--belt", "1.0,law=coulomb,static=1,kinetic=0.6", "--force", "0.9,1.3"]
+    out = tmp_path / "run"
+    result = CliRunner().invoke(app, ["simulate", *belt, "--t1", "20", "--out", str(out), "--json"])
+    assert result.exit_code == 0, result.output
+    law = jb.Coulomb(1.0, 0.6)
+    osc = jb.Oscillator(0.5, (jb.Belt(1.0, law),), forcing=jb.Harmonic(0.9, 1.3))
+    run = jb.simulate(osc, (3.0, 0.0), 20.0, ts=[20.0])
+    told = json.loads(result.output)
+    assert told["x1"] == pytest.approx(float(run.ys[-1, 0]), abs=1e-9)
+    assert out.with_name("run.png").stat().st_size > 10_000
+
+
 def test_axes_by_name():
     """Of a class its arguments, then anything by its path; dataset.attrs["call"] can be run."""
     axes = {"nu0": 0.2, "belts[1].load": 0.7}

@@ -222,6 +222,15 @@ Belts = Annotated[
         show_default="the belts of the class",
     ),
 ]
+Forces = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--force",
+        help="A harmonic force on the mass, AMPLITUDE,FREQUENCY or AMPLITUDE,FREQUENCY,PHASE, over "
+        "the stiffness and in the time tau; give it once a force.",
+        show_default="none",
+    ),
+]
 Damping = Annotated[float, typer.Option(help="zeta = c / sqrt(k m).")]
 Omega = Annotated[float, typer.Option(help="sqrt(k / m).")]
 Json = Annotated[
@@ -261,6 +270,7 @@ class Description:
     belt: Belts = None
     damping: Damping = 0.5
     omega: Omega = 1.0
+    force: Forces = None
 
     @property
     def arguments(self) -> dict[str, float | None]:
@@ -277,6 +287,8 @@ class Description:
 
         varied: values of arguments of the class that vary.
         """
+        for text in self.force or ():
+            parts_of_force(text)
         given = _given(self.arguments | varied)
         if self.belt:
             if given:
@@ -312,17 +324,19 @@ class Description:
         A path is the place in the oscillator, such as belts[1].friction.steepness. Parameters that
         have a short name are listed under that, too.
         """
-        return _parameters(self.system, self.belt)
+        return _parameters(self.system, self.belt, self.force)
 
     def oscillator(self, **values: Any) -> "jb.Oscillator":
         """The oscillator; values: what differs from the options, as for `oscillator`."""
         given = {**self.arguments, **values}
-        return oscillator(self.system, self.belt, self.damping, self.omega, **given)
+        return oscillator(self.system, self.belt, self.damping, self.omega, self.force, **given)
 
     def along(self, axes: Iterable[str]) -> "Callable[..., jb.Oscillator]":
         """The oscillator as a function of its axes; the function's text, which datasets keep, can
         be run."""
-        rest = {"damping": self.damping, "omega": self.omega}
+        rest: dict[str, Any] = {"damping": self.damping, "omega": self.omega}
+        if self.force:
+            rest["force"] = tuple(self.force)
         if self.belt:
             return functools.partial(oscillator, belt=tuple(self.belt), **rest)
         axes, known = tuple(axes), CLASSES[self.system] | _given(self.arguments)
@@ -370,6 +384,7 @@ def oscillator(
     belt: Sequence[str] | None = None,
     damping: Any = 0.5,
     omega: Any = 1.0,
+    force: Sequence[str] | None = None,
     **values: Any,
 ) -> "jb.Oscillator":
     """The oscillator that the options describe: a class with its arguments, or belts in full.
@@ -379,13 +394,15 @@ def oscillator(
     arguments = {} if belt else CLASSES[system]
     named = {name: value for name, value in values.items() if name in arguments}
     from .. import presets
+    from ..model.forcing import Harmonic
     from ..model.oscillator import Oscillator
 
     if belt:
         belts = tuple(map(parse_belt, belt))
     else:
         belts = getattr(presets, f"class_{system}")(**CLASSES[system] | _given(named)).belts
-    osc, paths = Oscillator(damping, belts, omega), _parameters(system, belt)
+    forcing = tuple(Harmonic(*parts_of_force(text)) for text in force or ())
+    osc, paths = Oscillator(damping, belts, omega, forcing), _parameters(system, belt, force)
     others = _given({name: value for name, value in values.items() if name not in arguments})
     return _with(osc, {paths[name]: value for name, value in others.items()}) if others else osc
 
@@ -406,7 +423,9 @@ def _with(osc: "jb.Oscillator", values: dict[str, Any]) -> "jb.Oscillator":
     return changed
 
 
-def _parameters(system: str, belt: Sequence[str] | None) -> dict[str, str]:
+def _parameters(
+    system: str, belt: Sequence[str] | None, force: Sequence[str] | None = None
+) -> dict[str, str]:
     """See `Description.parameters`."""
     laws = [_parts_of_belt(text)[1] for text in belt or ()]
     if not laws:
@@ -416,6 +435,10 @@ def _parameters(system: str, belt: Sequence[str] | None) -> dict[str, str]:
     for i, law in enumerate(laws):
         fields = ("velocity", *(f"friction.{name}" for name in law), "load", "lower", "upper")
         paths += [f"belts[{i}].{field}" for field in fields]
+    for i, text in enumerate(force or ()):
+        # A force of frequency 0 is constant.
+        waves = ("amplitude", "frequency", "phase") if parts_of_force(text)[1] else ("amplitude",)
+        paths += [f"forcing[{i}].{field}" for field in waves]
     return short | {path: path for path in paths}
 
 
@@ -434,6 +457,19 @@ def names_in_words(names: Iterable[str], paths: dict[str, str]) -> str:
     short = dict.fromkeys([*names, *(name for name, path in paths.items() if name != path)])
     one = next(path for path in paths if ".friction." in path)
     return f"one of {', '.join(short)}, or a path such as {one} or belts[0].load"
+
+
+def parts_of_force(text: str) -> tuple[float, float, float]:
+    """Amplitude, frequency and phase of a force such as `0.3,1.7` or `0.3,1.7,0.5`."""
+    try:
+        amplitude, frequency, *phase = map(float, text.split(","))
+        (phase,) = phase or (0.0,)
+    except ValueError:
+        expected = "AMPLITUDE,FREQUENCY or AMPLITUDE,FREQUENCY,PHASE, numbers"
+        raise ValueError(f"force must be {expected}, got {text!r}") from None
+    if not all(map(math.isfinite, (amplitude, frequency, phase))) or frequency < 0:
+        raise ValueError(f"force must be finite numbers with a frequency >= 0, got {text!r}")
+    return amplitude, frequency, phase
 
 
 def parse_belt(text: str) -> "jb.Belt":

@@ -115,12 +115,14 @@ def simulate(
             v_star=v_star,
             eps=eps,
         )
+        from ..model.oscillator import has_clock
         from ..paper import steady_cycle
         from ..plotting.phase import draw_overview
         from ..plotting.style import journal_style, save
 
         out.parent.mkdir(parents=True, exist_ok=True)
-        cycle = steady_cycle(trajectory)
+        # With a clock a state that comes back is not yet a motion that repeats.
+        cycle = None if has_clock(osc) else steady_cycle(trajectory)
         with journal_style():
             figure = draw_overview(osc, trajectory, cycles=[cycle] if cycle else [])
             save(figure, written[0])

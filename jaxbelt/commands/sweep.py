@@ -36,7 +36,7 @@ VARIABLES = {
 OF_BELTS = ("sticks", "stick_duration", "mode_end")
 
 
-@describes("system", "belt", "damping", "omega")
+@describes("system", "belt", "damping", "omega", "force")
 def sweep(
     axes: Annotated[
         list[str],

@@ -31,7 +31,13 @@ from ..cycles.separatrices import Separatrix
 from ..model.equilibria import Equilibria, EquilibriumKind, stability
 from ..model.equilibria import equilibria as find_equilibria
 from ..model.modes import mode_acceleration
-from ..model.oscillator import Oscillator, check_oscillator, constant_force, refuse_clock
+from ..model.oscillator import (
+    Oscillator,
+    check_oscillator,
+    constant_force,
+    has_clock,
+    refuse_clock,
+)
 from ..model.transitions import mode_of_state
 from ..motion.simulate import Trajectory
 from ..numerics.compiling import jit
@@ -572,11 +578,19 @@ def _vector_field(osc, x1, x2):
 def draw_overview(
     osc: Oscillator, trajectory: Trajectory, *, cycles: Sequence[ClosedOrbit] = ()
 ) -> Figure:
-    """One trajectory on a page: its time histories, and beside them its phase portrait."""
+    """One trajectory on a page: its time histories, and beside them its phase portrait.
+
+    With a clock the plane of x1 and x2 shows the orbit alone: what bounds it moves.
+    """
     figure = journal_figure(7.2, 3.2)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.35, 1))
     x1 = figure.add_subplot(grid[0, 0])
     x2 = figure.add_subplot(grid[1, 0], sharex=x1)
     plot_time_history(trajectory, (x1, x2))
-    plot_phase_portrait(osc, trajectory, cycles=cycles, ax=figure.add_subplot(grid[:, 1]))
+    plane = figure.add_subplot(grid[:, 1])
+    if has_clock(osc):
+        plane.plot(*path_of(trajectory)[1].T, color=ORBIT_COLOUR, linewidth=0.7)
+        plane.set(xlabel="displacement $x_1$", ylabel="velocity $x_2$")
+    else:
+        plot_phase_portrait(osc, trajectory, cycles=cycles, ax=plane)
     return figure
