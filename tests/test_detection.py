@@ -1,6 +1,7 @@
 """The points that `scan` finds by itself, against the exact table, simulation and the oracle."""
 
 from collections import Counter
+from dataclasses import replace
 from itertools import pairwise
 
 import equinox as eqx
@@ -427,6 +428,12 @@ def test_a_fold_squeezed_together_with_a_canard_is_told_by_how_its_branches_end(
     assert 0.4 < jump < 0.6 and 0 < inside < 1e-4
     found = jb.refine(jb.NonsmoothFold(0), osc, where=where)
     assert found.status != Status.OK and len(found.sides[0].cycles) == 1
+    # Between a stable rest and a cycle that attracts there has to be something.
+    beside = (replace(osc.belts[0], velocity=jnp.asarray(point.value - 1e-5 * per)),)
+    portrait = jb.portrait(replace(osc, belts=beside))
+    assert portrait.status == Status.INCOMPLETE and len(portrait.cycles) == 1
+    ((low, high),) = portrait.gaps
+    assert high < portrait.cycles[0].x1_max < high + 1e-4 and high - low < 1e-9
 
 
 @pytest.mark.slow(first=True)

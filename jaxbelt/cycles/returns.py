@@ -132,20 +132,26 @@ class Returns:
     def __init__(
         self, osc: Oscillator, rests: Equilibria, reach: float, special: Sequence[float]
     ) -> None:
-        """rests: states of rest; special: tops near which the map may be steep."""
+        """rests: states of rest; special: tops of separatrices, near which the map may jump."""
         self.osc = osc
         self.gaps: list[tuple[float, float]] = []
         self._brackets: list[Bracket] = []
         self._hits: list[float] = []
+        self._leaps: list[tuple[float, float]] = []
         self._known: dict[float, float] = {}
         self.reach = reach
         self._edges = {float(edge) for edge in edges(osc)}
         self.intervals = self._intervals_of_tops(rests)
+        places = np.concatenate([*map(np.ravel, map(np.asarray, _positions(osc, rests)))])
+        self._separating = np.concatenate([np.array(special), places])
+        laws = [belt.friction for belt in osc.belts]
+        self._holds_by_more = any(float(one.static) > float(one.mu(jnp.zeros(()))) for one in laws)
         self._special = np.array([*special, *self._tops_after_sticking()])
         for low, high in self.intervals:
             self._search(low, high)
         self.cycles = self._solved()
         self.gaps = [gap for gap in self.gaps if not self._is_rounding(gap, rests)]
+        self.gaps += [gap for gap in _joined(self._leaps) if not self._has_unstable(gap)]
         outermost = self.intervals[-1][1]
         grows, bounded = bool(self(np.array([outermost]))[0] > outermost), bool(is_bounded(osc))
         self.escapes = grows and not bounded
@@ -362,7 +368,26 @@ class Returns:
                 found.append(behind)
             elif is_rounding or not abs(after - before) > JUMP:
                 self.gaps.append((float(a), float(b)))
+            elif not self._jumps(a, b):
+                self._leaps.append((float(a), float(b)))
         return found
+
+    def _has_unstable(self, gap: tuple[float, float]) -> bool:
+        """Whether the map leaps over the diagonal there as it is steep at an unstable cycle."""
+        tops = [float(cycle.x1_max) for cycle in self.cycles if float(cycle.multiplier) > 1]
+        margin = MAP_ERROR * (1 + abs(gap[1]))
+        return any(gap[0] - margin < top < gap[1] + margin for top in tops)
+
+    def _jumps(self, low: float, high: float) -> bool:
+        """Whether the map may jump between two tops.
+
+        It does so at the top of a separatrix, at edges and states of rest themselves, and where a
+        mass arrives at a boundary that holds it by more than kinetic friction. A steep law that has
+        none of these makes the map steep, too.
+        """
+        margin = high - low + MAP_ERROR * (1 + abs(high))
+        at = (low - margin < self._separating) & (self._separating < high + margin)
+        return self._holds_by_more or bool(np.any(at))
 
     def _cycle_at(self, top: float, low: float, high: float) -> Cycle | None:
         """The cycle with its top between two tops, from the loop of one between them, or None."""
@@ -395,6 +420,16 @@ def _if_at_home(cycle: Cycle, top: float, width: float) -> Cycle | None:
     growth = min(abs(float(cycle.multiplier) - 1), 1.0)
     margin = width + MAP_ERROR * (1 + abs(top)) / max(growth, NEUTRAL)
     return cycle if abs(float(cycle.x1_max) - top) < margin and growth > NEUTRAL else None
+
+
+def _joined(gaps: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Intervals, with those as one that touch up to rounding."""
+    joined: list[tuple[float, float]] = []
+    for low, high in sorted(gaps):
+        if joined and low - joined[-1][1] < NARROWEST * (1 + abs(low)):
+            low, high = joined[-1][0], max(high, joined.pop()[1])
+        joined.append((low, high))
+    return joined
 
 
 def _with_tops_apart(cycles: Sequence[Cycle]) -> list[Cycle]:
