@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from .forcing import Oscillating
 from .modes import (
@@ -262,7 +262,7 @@ def at_zero(osc: Oscillator, mode: Mode, y: TimedState, k: Array) -> list[Array]
 
 def begun_at(osc: Oscillator, y: TimedState) -> tuple[Mode, Array]:
     """The mode of a start, and whether it is a pseudo-focus: at rest on an edge to which it is
-    pushed from both sides."""
+    pushed from both sides for ever."""
     sides = [_start_on_side(osc, y, rightward) for rightward in (False, True)]
     (left, a_left), (right, a_right) = sides
     if not has_edges(osc):
@@ -275,6 +275,7 @@ def begun_at(osc: Oscillator, y: TimedState) -> tuple[Mode, Array]:
     to_right = jnp.where(rests, goes_right, y[1] > 0)
     on_edge = any_of([y[0] == edge for edge in edges(osc)])
     focus = on_edge & rests & ~same & (a_left > 0) & (a_right < 0)
+    focus = focus & _pushes_for_ever(osc, left, y, 1.0) & _pushes_for_ever(osc, right, y, -1.0)
     return select(to_right, right, left), focus
 
 
@@ -371,6 +372,8 @@ def passed_guard(osc: Oscillator, mode: Mode, guard: Array, y: TimedState) -> In
         inward = jnp.where(rightward, 1.0, -1.0)
         pushed = (a * inward > 0) & (a_past * inward < 0)
         captured = at_edge & ~stuck & ~past.any_stuck & pushed & (jnp.abs(x2) < LOST_AT_EDGE)
+        captured = captured & _pushes_for_ever(osc, mode, y, inward)
+        captured = captured & _pushes_for_ever(osc, past, y, -inward)
     return Instant((y[0], jnp.where(captured, 0.0, x2), t), after, captured)
 
 
@@ -380,7 +383,6 @@ def is_held_for_ever(osc: Oscillator, mode: Mode, y: TimedState) -> Array:
 
     Where that is not known the answer is no.
     """
-    now = at_time(osc, y[2])
     still, limit = mode.any_stuck, jnp.zeros(())
     for belt, touches, stuck in zip(osc.belts, mode.touching, mode.stuck, strict=True):
         v, load = belt.velocity, belt.load
@@ -389,8 +391,28 @@ def is_held_for_ever(osc: Oscillator, mode: Mode, y: TimedState) -> Array:
         still = still & (~touches | jnp.where(stuck, rests, jnp.asarray(constant)))
         least = load.mean - jnp.abs(load.amplitude) if isinstance(load, Oscillating) else load
         limit = limit + jnp.where(stuck, least * belt.friction.static, 0.0)
-    pushes = [force.force(y[2]) for force in now.forcing]
-    rest = mode_acceleration(now, mode, y[0], y[1]) - functools.reduce(jnp.add, pushes)
-    bounds = [force.bound(osc.damping) for force in osc.forcing]
-    largest = jnp.abs(rest) + functools.reduce(jnp.add, bounds, jnp.zeros(()))
+    rest, bound = _pushes(osc, mode, y)
+    largest = jnp.abs(rest) + bound
     return still & (largest <= limit * (1 + GUARD_ROUNDING)) & (limit > 0)
+
+
+def _pushes_for_ever(osc: Oscillator, mode: Mode, y: TimedState, sign: ArrayLike) -> Array:
+    """Whether the acceleration of a slip mode at a place has that sign whatever the clock says.
+
+    Where that is not known, as with belts that oscillate, the answer is no.
+    """
+    steady = jnp.asarray(True)
+    for belt, touches in zip(osc.belts, mode.touching, strict=True):
+        if isinstance(belt.velocity, Oscillating) or isinstance(belt.load, Oscillating):
+            steady = steady & ~touches
+    rest, bound = _pushes(osc, mode, y)
+    return steady & (sign * rest > bound)
+
+
+def _pushes(osc: Oscillator, mode: Mode, y: TimedState) -> tuple[Array, Array]:
+    """The acceleration of a mode without the forces, and a bound of these at all times."""
+    now = at_time(osc, y[2])
+    forces = [force.force(y[2]) for force in now.forcing]
+    rest = mode_acceleration(now, mode, y[0], y[1]) - functools.reduce(jnp.add, forces)
+    bounds = [force.bound(osc.damping) for force in osc.forcing]
+    return rest, functools.reduce(jnp.add, bounds, jnp.zeros(()))
