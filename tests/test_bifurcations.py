@@ -134,6 +134,7 @@ def test_a_belt_that_does_not_touch_where_another_is_crossed_has_no_part_in_it()
     assert jb.refine(jb.CrossingSliding(1), make, at=0.14).status != Status.OK
 
 
+@pytest.mark.slow(first=True)
 def test_points_of_another_system():
     osc = other_system()
     hopf = jb.refine(jb.Hopf(), osc, where=nu0)

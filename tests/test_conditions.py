@@ -178,6 +178,7 @@ def test_mistakes_in_a_condition_of_ones_own_are_named():
             jb.scan(osc, nu0, (0.1, 0.2), conditions=[one])
 
 
+@pytest.mark.slow(first=True)
 def test_a_condition_without_words_goes_by_its_name():
     point = jb.refine(Plain(8.0), jb.presets.class_a(0.2), where=nu0)
     assert point.status == Status.OK and point.condition.words == "Plain"

@@ -238,6 +238,7 @@ def test_refined_from_either_side(diagram, condition, number, offset):
     assert point.iterations <= 7 and point.residual < 1e-11 and point.error < 1e-11
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("offset", [-0.01, 0.01])
 @pytest.mark.parametrize("exact", [0.9, 1.66])
 def test_slip_onset_in_a_corner(exact, offset):
@@ -248,6 +249,7 @@ def test_slip_onset_in_a_corner(exact, offset):
     assert point.residual < 1e-12 and point.error < 1e-12
 
 
+@pytest.mark.slow(first=True)
 def test_a_corner_in_which_the_cycle_ends():
     """The phase begins and ends in the corner, and there is no cycle beyond."""
     inside, beyond = (jb.presets.class_c(0.233547455622 + d, -0.25, 0.4) for d in (-0.01, 0.01))
@@ -318,6 +320,7 @@ def test_a_belt_at_rest_that_no_cycle_sticks_to():
     assert point.status == Status.NOT_TOUCHED and jnp.isnan(point.value)
 
 
+@pytest.mark.slow(first=True)
 def test_a_small_cycle_that_sticks_until_the_edge():
     """It never comes to slip onset. Beside it there is one that does, and touches belt 0 alone."""
     osc = jb.presets.class_d(-0.6, 0.175, 1.16, 1.5)
@@ -343,6 +346,7 @@ def test_the_onset_of_a_belt_that_touches_on_the_right_only():
     assert points[0].value == pytest.approx(0.267134534361, abs=1e-11)
 
 
+@pytest.mark.slow(first=True)
 def test_unstable_cycles_around_two_equilibria():
     """Each belt has its own, that of the paper's class (a), as neither reaches the edge."""
     osc = jb.presets.class_c(-0.246, 0.22, 0.3141)
@@ -360,6 +364,7 @@ def test_unstable_cycles_around_two_equilibria():
     assert sorted(np.sign(branch.x1_max[0]) for branch in repelling) == [-1, 1]
 
 
+@pytest.mark.slow(first=True)
 def test_what_fits_no_such_point_is_told_so():
     # Everything comes to rest.
     point = jb.refine(jb.GrazingEdge(0), jb.presets.class_d(0.35, 0.6, 0.0, 0.6), where=sigma1)
@@ -387,6 +392,7 @@ def test_one_edge_of_two_on_which_something_rests_whatever_the_parameter():
         assert (point.value, point.x1) == pytest.approx((1.0, 0.0), abs=1e-14)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(
     ("guess", "value", "edge", "kind"),
     [
@@ -697,6 +703,7 @@ def fold_with_onset_on_its_edge():
     return brentq(gap, 0.25, 0.35, xtol=1e-14)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("guess", [0.31, 0.25])
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize("offset", [0.0, -1e-13, 1e-13])

@@ -298,6 +298,7 @@ def test_impossible_arguments_are_named(points, where, span, message):
         jb.bifurcation_curve(points[0], where, span)
 
 
+@pytest.mark.slow(first=True)
 def test_nothing_departs_from_a_belt_at_rest_in_a_focus():
     """The cycle there shrinks with the velocity of the belt, in a ratio that is known."""
     law = jb.Conti(1.0, 0.6, 2.0)
@@ -419,6 +420,7 @@ def test_a_curve_turns_where_a_slip_onset_comes_to_an_edge():
         assert again.value == pytest.approx(q, abs=1e-12)
 
 
+@pytest.mark.slow(first=True)
 def test_a_curve_of_corners_ends_where_its_cycle_shrinks_with_a_belt_to_a_pseudo_focus():
     """Class (c), sigma = -1/2, at (0, -1/2): a_L = 1/2 + mu(0), tr_L = 4 - zeta there, and a_R =
     1/2 - mu(1/2), tr_R = 4/36 - zeta, so that tr_L/a_L = 7/3 = -tr_R/|a_R|: the rate is zero."""

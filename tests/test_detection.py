@@ -220,6 +220,7 @@ def test_two_cycles_with_one_sequence_of_events():
         assert len(distinct([jb.find_cycle(osc, start) for start in starts])) == count
 
 
+@pytest.mark.slow(first=True)
 def test_a_corner_where_only_the_sign_of_what_arrives_changes():
     """Belt 1 begins where the mass sticks to belt 0 before the point, and slips on it after."""
     law = jb.Conti(1.09, 0.42, 12.8)

@@ -183,6 +183,7 @@ def test_a_fold_of_cycles_ends_at_a_degenerate_pseudo_hopf_point(degenerate):
 # --- other kinds ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(first=True)
 def test_hopf_points():
     """A bell bends both ways, a law without a slope not at all."""
     nu0 = lambda osc: osc.belts[0].velocity  # noqa: E731
