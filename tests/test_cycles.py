@@ -176,6 +176,7 @@ def test_no_cycle_crosses_where_the_mass_would_stick():
     assert sticks.status == Status.OK and jb.stick_duration(sticks, 0) > 0
 
 
+@pytest.mark.slow(first=True)
 def test_no_arc_of_a_cycle_passes_an_extremum_of_x1():
     """What solves the equations of a chain that does not mark it would tell a wrong amplitude."""
     osc = jb.Oscillator(0.5, (jb.Belt(0.4, jb.Conti(1.0, 0.25, 10.0), upper=0.9),))
@@ -518,6 +519,7 @@ def assert_repels(cycle, osc):
     assert next_top(inside) < inside and next_top(outside) > outside
 
 
+@pytest.mark.slow(first=True)
 def test_unstable_cycles_that_repel_strongly_are_found():
     """At a belt's load just above a nonsmooth fold, multipliers of ten thousand; they were found
     only where they are below a thousand."""

@@ -101,6 +101,7 @@ def test_of_a_run_with_edges_that_are_divided(slopes_of_end):
     assert jax.jit(jax.jacfwd(of))(AT) == pytest.approx(slopes_of_end, rel=TOLERANCE)
 
 
+@pytest.mark.slow(first=True)
 def test_of_the_edges_of_a_machine():
     def edges(p):
         belt = jb.PhysicalBelt(0.1, jb.Coulomb(0.4, 0.3), p[0], upper=0.004)

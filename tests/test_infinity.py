@@ -40,6 +40,7 @@ def one_belt(damping, law=LAW, omega=1.0, **changes):
     return jb.Oscillator(damping, (jb.Belt(0.3, law, **changes),), omega=omega)
 
 
+@pytest.mark.slow(first=True)
 def test_without_damping():
     point = jb.refine(CONDITION, one_belt, at=-0.1)
     assert point.status == Status.OK and point.value == 0

@@ -98,6 +98,7 @@ def test_a_trajectory_of_another_machine(run):
     assert alone.identical(whole.drop_vars("force"))
 
 
+@pytest.mark.slow(first=True)
 def test_a_portrait_and_a_shock_in_si():
     """Of one that was put together by hand; a cycle and an equilibrium are real ones."""
     m = machine()

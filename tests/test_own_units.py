@@ -59,7 +59,11 @@ def same(values, others, factor=1.0):
     np.testing.assert_array_equal(np.asarray(values) * factor, np.asarray(others))
 
 
-@pytest.fixture(params=UNITS, ids=str)
+#: The largest change of both units is among the quick tests.
+RARELY = [pytest.param(one, marks=pytest.mark.slow(first=True)) for one in UNITS if one[0] < 0]
+
+
+@pytest.fixture(params=[*RARELY, *(one for one in UNITS if one[0] > 0)], ids=str)
 def units(request):
     k, m = request.param
     return 2.0**k, 2.0**m

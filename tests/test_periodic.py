@@ -143,6 +143,7 @@ def on_a_belt(nu, frequency, damping, amplitude, package):
     return forced.Oscillator(damping, belts, (forced.Harmonic(amplitude, frequency),))
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(
     ("condition", "numbers", "guess"),
     [

@@ -371,6 +371,7 @@ def test_a_reflected_run_is_the_same_to_the_last_bit():
             assert found.events == original(0, number).events
 
 
+@pytest.mark.slow(first=True)
 @seeds
 def test_three_belts_in_another_order(seed):
     rng = np.random.default_rng(seed)

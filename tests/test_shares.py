@@ -18,6 +18,7 @@ def dataset():
     return jb.sweep(jb.presets.class_b, axes, observe="attractor")
 
 
+@pytest.mark.slow(first=True)
 def test_attractors_and_fractions_are_those_of_basins(dataset):
     found = jb.attractors(dataset)
     assert found.fraction.dims == ("nu0", "nu1", "attractor") and found.attractor.size == 2

@@ -61,6 +61,7 @@ def test_it_shrinks_to_the_focus_where_the_belt_is_at_rest():
     assert run.status == engine.PSEUDO_FOCUS and run.y_end == (EDGE, 0.0)
 
 
+@pytest.mark.slow(first=True)
 def test_a_focus_that_repels_on_one_side_only():
     damping = 2.2
     assert rate(-1e-6, damping) < 0 < rate(1e-6, damping)

@@ -215,6 +215,7 @@ def test_a_path_that_is_not_linear_has_the_points_of_the_straight_one():
         assert math.exp(one.value) == pytest.approx(float(other.value), abs=1e-11)
 
 
+@pytest.mark.slow(first=True)
 def test_its_diagram_is_named_by_its_argument():
     diagram = jb.bifurcation_diagram(sequential, span=(-0.8, -0.6), rows=9, resolution=8)
     assert diagram.name == "sigma"
