@@ -335,10 +335,98 @@ def _window_of(cycles: list[jb.Cycle], rests: list[jb.Equilibria]) -> dict:
     return {"xlim": limits[0], "ylim": limits[1]}
 
 
+# --- bifurcations of forced oscillators -----------------------------------------------------------
+
+
+class ForcedCase(NamedTuple):
+    """A kind of bifurcation of periodic motions: where it is, and to what sides.
+
+    start: a state at the phase 0 that leads to the motion at the guess.
+    """
+
+    condition: AbstractCondition
+    make: Callable
+    symbol: str
+    guess: float
+    before: float
+    after: float
+    start: tuple[float, float]
+
+
+def on_a_belt(nu: float, frequency: float) -> Callable:
+    """A mass on one belt, of the amplitude of the force."""
+    law = jb.Coulomb(1.0, 0.6)
+    return lambda F: jb.Oscillator(0.05, (jb.Belt(nu, law),), forcing=jb.Harmonic(F, frequency))
+
+
+def on_a_cubic_belt(nu: float) -> jb.Oscillator:
+    """A mass that is pushed, on a belt of that velocity with a cubic law."""
+    belts = (jb.Belt(nu, jb.Cubic(1.5, 1.5, 0.45)),)
+    return jb.Oscillator(0.0, belts, forcing=jb.Harmonic(0.05, 1.7))
+
+
+FORCED = {
+    "PeriodDoubling": ForcedCase(
+        *(jb.PeriodDoubling(), jb.presets.di_bernardo, r"\Omega"),
+        *(1.73, 1.73, 1.709, (0.5, 0.0)),
+    ),
+    "Fold": ForcedCase(
+        *(jb.Fold(), jb.presets.di_bernardo, r"\Omega", 1.68, 1.67, 1.69, (0.5, 0.0)),
+    ),
+    "Torus": ForcedCase(
+        *(jb.Torus(), on_a_cubic_belt, r"\nu_0", 1.07, 1.1, 1.04, (1.4, 0.0)),
+    ),
+    "AddingSliding": ForcedCase(
+        *(jb.AddingSliding(0), on_a_belt(0.1, 1.5), "F", 0.95, 0.95, 1.02, (1.0, 0.0)),
+    ),
+    "SwitchingSliding": ForcedCase(
+        *(jb.SwitchingSliding(0), on_a_belt(0.9, 1.3), "F", 0.9, 0.78, 0.95, (1.0, 0.0)),
+    ),
+}
+
+
+def forced_bifurcation(case: ForcedCase) -> Figure:
+    """Attractors before and after a point, and the motion at it, in the plane of x1 and x2."""
+    point = jb.refine(case.condition, case.make, at=case.guess, start=case.start)
+    assert point.status == jb.Status.OK, point
+    value = float(point.value)
+    print(f"  {point.kind}: {value:.6f}")
+    figure = journal_figure(7.2, 3.0)
+    axes = figure.subplots(1, 3, sharex=True, sharey=True)
+    for ax, at in zip(axes, (case.before, value, case.after)):
+        if at == value:
+            point.cycle.plot(ax)
+        else:
+            _draw_attractor(case.make(at), np.asarray(point.cycle.start), ax)
+        ax.set_title(f"${case.symbol} = {at:.5g}$")
+        ax.label_outer()
+        if ax.get_legend() is not None:
+            ax.get_legend().remove()
+    draw_key(figure)
+    return figure
+
+
+def _draw_attractor(osc: jb.Oscillator, start: np.ndarray, ax) -> None:
+    """The periodic motion that a start leads to, or, where there is none, a long orbit."""
+    motion = jb.find_cycle(osc, start)
+    if int(motion.status) == jb.Status.OK:
+        motion.plot(ax)
+        return
+    period = 2 * np.pi / float(osc.forcing[0].frequency)
+    settled = jb.simulate(osc, start, 400 * period, ts=[400 * period], max_segments=16384).ys[-1]
+    ts = np.linspace(0.0, 60 * period, 60 * 64 + 1)
+    states = np.asarray(jb.simulate(osc, settled, ts[-1], ts=ts, max_segments=4096).ys)
+    ax.plot(*states.T, color="0.5", linewidth=0.4, label="orbit")
+    ax.plot(*states[::64].T, "o", color="black", markersize=2, label="phase 0")
+    ax.axhline(float(osc.belts[0].velocity), color="#0072B2", linewidth=0.8, label="belt 0")
+    ax.set(xlabel="displacement $x_1$", ylabel="velocity $x_2$")
+
+
 def main(names: list[str]) -> None:
     """Draws the pictures of these names, or all."""
     drawings = {draw.__name__: draw for draw in GALLERY}
     drawings |= {name: lambda case=case: bifurcation(case) for name, case in CASES.items()}
+    drawings |= {name: lambda case=case: forced_bifurcation(case) for name, case in FORCED.items()}
     for name in names or drawings:
         print(name, flush=True)
         with journal_style():
