@@ -151,7 +151,7 @@ class Returns:
             self._search(low, high)
         self.cycles = self._solved()
         self.gaps = [gap for gap in self.gaps if not self._is_rounding(gap, rests)]
-        self.gaps += [gap for gap in _merged(self._leaps) if not self._has_unstable(gap)]
+        self.gaps += [gap for gap in _touching_joined(self._leaps) if not self._has_unstable(gap)]
         outermost = self.intervals[-1][1]
         grows, bounded = bool(self(np.array([outermost]))[0] > outermost), bool(is_bounded(osc))
         self.escapes = grows and not bounded
@@ -422,7 +422,7 @@ def _if_at_home(cycle: Cycle, top: float, width: float) -> Cycle | None:
     return cycle if abs(float(cycle.x1_max) - top) < margin and growth > NEUTRAL else None
 
 
-def _merged(gaps: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+def _touching_joined(gaps: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     """Intervals, with those as one that touch up to rounding."""
     joined: list[tuple[float, float]] = []
     for low, high in sorted(gaps):
