@@ -122,7 +122,7 @@ def simulated_slopes(case, kind, tolerance):
 
 def _leaves(kind):
     def leaves(parts):
-        return jax.tree.leaves(in_units_of_run(oscillator(parts, kind == "jump")))
+        return jax.tree.leaves(in_units_of_run(oscillator(parts, kind == "jump"), edges=True))
 
     return jax.vmap(leaves, (AXES,))
 
@@ -137,9 +137,8 @@ def sweep_all(case, kind, tolerance, along=()):
         slopes = jax.jvp(leaves, (parts,), (d_parts,))[1]
         rows.append(np.stack([*map(np.asarray, d_start), *map(np.asarray, slopes)]))
     table, n = np.stack(rows), case.belt.size
-    one = in_units_of_run(
-        oscillator({k: part[..., 0] for k, part in parts.items()}, kind == "jump")
-    )
+    first = {k: part[..., 0] for k, part in parts.items()}
+    one = in_units_of_run(oscillator(first, kind == "jump"), edges=True)
     mapped = (True,) * (table.shape[1] - 2)
     program = Program(jax.tree.structure(one), mapped, Final(), True)
     shapes = layout(program, [])
