@@ -258,6 +258,13 @@ class Variation:
         )
         if known is not None:
             return known.oscillator
+        if is_concrete(values) and not np.all(np.isfinite(np.asarray(values))):
+            # A function of the user's would refuse it.
+            shapes = eqx.filter_eval_shape(self.make, *(jnp.asarray(value) for value in values))
+            return jax.tree.map(
+                lambda leaf: jnp.full(leaf.shape, jnp.nan) if hasattr(leaf, "shape") else leaf,
+                shapes,
+            )
         made = self.make(*(jnp.asarray(value) for value in values))
         return jax.tree.map(lambda x: jnp.asarray(x, jnp.float64) if is_real(x) else x, made)
 
