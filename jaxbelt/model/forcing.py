@@ -171,7 +171,22 @@ class ConstantForce(AbstractForce):
         return f"Harmonic(amplitude={number(self.amplitude)}, frequency=0)"
 
 
-class Harmonic(AbstractForce):
+class _Sinusoid(AbstractForce):
+    """A force of one wave, by its amplitude, frequency and phase."""
+
+    amplitude: Float[Array, ""] = eqx.field(converter=_number_named("amplitude"))
+    frequency: Float[Array, ""] = eqx.field(converter=_number_named("frequency"))
+    phase: Float[Array, ""] = eqx.field(converter=_number_named("phase"), default=0.0)
+
+    def __check_init__(self):
+        self.check(type(self).__name__)
+
+    @property
+    def fastest(self) -> Array:
+        return self.frequency
+
+
+class Harmonic(_Sinusoid):
     """A harmonic force, amplitude cos(frequency tau + phase).
 
     Args:
@@ -182,17 +197,6 @@ class Harmonic(AbstractForce):
     Raises:
         ValueError: If an argument is impossible; the message names it.
     """
-
-    amplitude: Float[Array, ""] = eqx.field(converter=_number_named("amplitude"))
-    frequency: Float[Array, ""] = eqx.field(converter=_number_named("frequency"))
-    phase: Float[Array, ""] = eqx.field(converter=_number_named("phase"), default=0.0)
-
-    def __check_init__(self):
-        self.check("Harmonic")
-
-    @property
-    def fastest(self) -> Array:
-        return self.frequency
 
     def bound(self, damping: ArrayLike) -> Array:
         return jnp.abs(self.amplitude)
@@ -206,7 +210,7 @@ class Harmonic(AbstractForce):
         return _made(Harmonic, amplitude=amplitude, frequency=frequency, phase=self.phase)
 
 
-class BaseMotion(AbstractForce):
+class BaseMotion(_Sinusoid):
     """A support that moves by amplitude cos(frequency tau + phase); spring and dashpot are fixed to
     it.
 
@@ -222,17 +226,6 @@ class BaseMotion(AbstractForce):
     Raises:
         ValueError: If an argument is impossible; the message names it.
     """
-
-    amplitude: Float[Array, ""] = eqx.field(converter=_number_named("amplitude"))
-    frequency: Float[Array, ""] = eqx.field(converter=_number_named("frequency"))
-    phase: Float[Array, ""] = eqx.field(converter=_number_named("phase"), default=0.0)
-
-    def __check_init__(self):
-        self.check("BaseMotion")
-
-    @property
-    def fastest(self) -> Array:
-        return self.frequency
 
     def bound(self, damping: ArrayLike) -> Array:
         return jnp.abs(self.amplitude) * jnp.sqrt(1 + (damping * self.frequency) ** 2)
@@ -367,7 +360,7 @@ def as_forcing(forcing: Any) -> tuple[AbstractForce, ...]:
 
 
 def _without_frequency(force: AbstractForce) -> AbstractForce:
-    if not isinstance(force, Harmonic | BaseMotion) or not _is_zero(force.frequency):
+    if not isinstance(force, _Sinusoid) or not _is_zero(force.frequency):
         return force
     return ConstantForce(force.amplitude * _cosine(force.phase))
 
