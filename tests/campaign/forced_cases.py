@@ -186,6 +186,19 @@ def structures(rng, programs):
     return first[:programs]
 
 
+def batches(options, size, programs):
+    """A structure and a number of runs, `size` at most, each."""
+    found = structures(np.random.default_rng(options.seed), programs)
+    if options.structure is not None:
+        found = found[options.structure : options.structure + 1]
+    each = -(-options.runs // len(found))
+    return [
+        (structure, min(size, each - first))
+        for structure in found
+        for first in range(0, each, size)
+    ]
+
+
 def case(rng, structure, T=60.0):
     """A random case, or one on round numbers."""
     return (round_case if rng.random() < 0.5 else random_case)(rng, structure, T)

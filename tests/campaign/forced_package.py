@@ -11,7 +11,7 @@ import jaxbelt as jb
 from . import forced, forced_cases
 from .package import MANY_SEGMENTS, Final
 
-_LAWS = {
+LAWS = {
     "conti": jb.Conti,
     "coulomb": jb.Coulomb,
     "stribeck": jb.Stribeck,
@@ -26,7 +26,7 @@ def _wave(wave):
 def oscillator(osc):
     """The same oscillator as the package's."""
     belts = tuple(
-        jb.Belt(_wave(b.velocity), _LAWS[b.law[0]](*b.law[1:]), _wave(b.load), b.lower, b.upper)
+        jb.Belt(_wave(b.velocity), LAWS[b.law[0]](*b.law[1:]), _wave(b.load), b.lower, b.upper)
         for b in osc.belts
     )
     forces = tuple(jb.Harmonic(f.amplitude, f.frequency, f.phase) for f in osc.forces)
@@ -82,7 +82,7 @@ def _of_numbers(structure, sizes, values, rest):
     rows = zip(structure.laws, structure.velocities, structure.loads, sizes, strict=True)
     for law, moves, swells, size in rows:
         velocity, load, static = wave(moves), wave(swells), next(values)
-        friction = _LAWS[law](static, *(next(rest) for _ in range(size)))
+        friction = LAWS[law](static, *(next(rest) for _ in range(size)))
         edges = next(values), next(values)
         belts.append(jb.Belt(velocity, friction, load, *(edges if structure.edges else ())))
     forces = tuple(jb.Harmonic(*(next(values) for _ in range(3))) for _ in range(structure.forces))

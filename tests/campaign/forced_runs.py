@@ -26,16 +26,7 @@ def numbers(options):
 
 
 def _batches(options):
-    """A structure and a number of runs each."""
-    found = forced_cases.structures(np.random.default_rng(options.seed), PROGRAMS)
-    if options.structure is not None:
-        found = found[options.structure : options.structure + 1]
-    each = -(-options.runs // len(found))
-    return [
-        (structure, min(BATCH, each - first))
-        for structure in found
-        for first in range(0, each, BATCH)
-    ]
+    return forced_cases.batches(options, BATCH, PROGRAMS)
 
 
 def outcome(options, number):

@@ -14,19 +14,13 @@ import jaxbelt as jb
 from jaxbelt.model.own_units import in_units_of_run
 from jaxbelt.sweeps import question
 
-from . import forced, forced_cases
+from . import forced, forced_cases, forced_package
 from .outcome import Outcome
 from .package import Final
 from .runs import said as said
 
 #: Runs in one call, and structures, each a compilation.
 BATCH, PROGRAMS = 1024, 12
-_LAWS = {
-    "conti": jb.Conti,
-    "coulomb": jb.Coulomb,
-    "stribeck": jb.Stribeck,
-    "cubic": jb.Cubic,
-}
 _SIZES = {"conti": 4, "coulomb": 2, "stribeck": 3, "cubic": 3}
 
 
@@ -39,16 +33,7 @@ def numbers(options):
 
 
 def _batches(options):
-    """A structure and a number of runs each."""
-    found = forced_cases.structures(np.random.default_rng(options.seed), PROGRAMS)
-    if options.structure is not None:
-        found = found[options.structure : options.structure + 1]
-    each = -(-options.runs // len(found))
-    return [
-        (structure, min(BATCH, each - first))
-        for structure in found
-        for first in range(0, each, BATCH)
-    ]
+    return forced_cases.batches(options, BATCH, PROGRAMS)
 
 
 def outcome(options, number):
@@ -108,7 +93,7 @@ def _from_numbers(structure, row):
     rows = zip(structure.laws, structure.velocities, structure.loads, strict=True)
     for law, moves, swells in rows:
         velocity, load = wave(moves), wave(swells)
-        friction = _LAWS[law](*(next(values) for _ in range(_SIZES[law])))
+        friction = forced_package.LAWS[law](*(next(values) for _ in range(_SIZES[law])))
         edges = (next(values), next(values)) if structure.edges else ()
         belts.append(jb.Belt(velocity, friction, load, *edges))
     forces = tuple(jb.Harmonic(*(next(values) for _ in range(3))) for _ in range(structure.forces))
