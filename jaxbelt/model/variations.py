@@ -253,12 +253,10 @@ class Variation:
         """The oscillator at these values, [k]; whether it is a possible one is not asked."""
         if self.line is not None:
             return self.line.at(values)
-        known = (
-            self.tangents.get(tuple(np.asarray(values).tolist())) if is_concrete(values) else None
-        )
-        if known is not None:
-            return known.oscillator
-        if is_concrete(values) and not np.all(np.isfinite(np.asarray(values))):
+        row = tuple(np.asarray(values).tolist()) if is_concrete(values) else None
+        if row in self.tangents:
+            return self.tangents[row].oscillator
+        if row is not None and not np.all(np.isfinite(row)):
             # A function of the user's would refuse it.
             shapes = eqx.filter_eval_shape(self.make, *(jnp.asarray(value) for value in values))
             return jax.tree.map(
