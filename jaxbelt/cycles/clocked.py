@@ -26,7 +26,7 @@ from jaxtyping import Array
 
 from ..checks import require
 from ..model.instants import carried, guards_at, trend_of
-from ..model.modes import capacity, mode_acceleration, mode_of, select
+from ..model.modes import Mode, capacity, mode_acceleration, mode_of, select
 from ..model.oscillator import Oscillator, at_time, frequencies
 from ..motion.arcs import Ends
 from ..motion.integrators import density
@@ -374,15 +374,22 @@ def guards_along(osc: Oscillator, chain: TimedChain, z: Array) -> tuple[Array, A
 
 
 def least_guard(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array) -> Array:
-    """The least value that a guard of its mode has along an arc, up to rounding.
-
-    Between the ends of steps a guard is the quintic with its values, slopes and curvatures there.
-    """
+    """The least value that a guard of its mode has along an arc, up to rounding."""
     mode = mode_of(codes)
     states = states_along(osc, codes, mesh, y, duration)
-    at = jax.vmap(
-        lambda y: trend_of(osc, mode, lambda y: guards_at(osc, mode, y), (y[0], y[1], y[2]))
-    )(states)
+    _, values = _least_in_steps(osc, mode, states, lambda y: guards_at(osc, mode, y))
+    return jnp.min(values)
+
+
+def _least_in_steps(
+    osc: Oscillator, mode: Mode, states: Array, numbers: Callable
+) -> tuple[Array, Array]:
+    """Where in each step of an arc each of some numbers of the state is least, as a fraction of the
+    step, and its value there, [steps, numbers]; inf where it is not finite.
+
+    Between the ends of steps a number is the quintic with its values, slopes and curvatures there.
+    """
+    at = jax.vmap(lambda y: trend_of(osc, mode, numbers, (y[0], y[1], y[2])))(states)
     there = jnp.isfinite(at.value)
     h = jnp.diff(states[:, 2])[:, None]
     value, slope, curvature = (jnp.where(there, one, 0.0) for one in at)
@@ -397,18 +404,54 @@ def least_guard(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: 
 
     places = jnp.linspace(0.0, 1.0, 9)
     values = jnp.stack([quintic(s) for s in places])
-    s = places[jnp.argmin(values, axis=0)]
+    s = nearest = places[jnp.argmin(values, axis=0)]
     for _ in range(4):
         first, second = _derivatives(powers, s)
         s = jnp.clip(s - first / jnp.where(second > 0, second, jnp.inf), 0.0, 1.0)
-    least = jnp.minimum(jnp.min(values, axis=0), quintic(s))
-    return jnp.min(jnp.where(there[:-1], least, jnp.inf))
+    before, least = jnp.min(values, axis=0), quintic(s)
+    place = jnp.where(least <= before, s, nearest)
+    return place, jnp.where(there[:-1], jnp.minimum(before, least), jnp.inf)
 
 
 def _derivatives(powers: list[Array], s: Array) -> tuple[Array, Array]:
     first = sum(k * p * s ** (k - 1) for k, p in enumerate(powers) if k)
     second = sum(k * (k - 1) * p * s ** (k - 2) for k, p in enumerate(powers) if k > 1)
     return jnp.asarray(first), jnp.asarray(second)
+
+
+@jit
+def extremes_along(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
+    """The least and the largest x1, and the same of x2, of a closed chain with the unknowns z, [4].
+
+    Where they are is found first; there the state depends on the oscillator and on z, and by the
+    time it does not change.
+    """
+
+    def one(osc, codes, mesh, unknown):
+        """The fraction of the duration of an arc at which each is, and its value with the sign that
+        makes it the least, [2, 4]."""
+        states = states_along(osc, codes, mesh, unknown[:3], unknown[3])
+        places, values = _least_in_steps(
+            osc, mode_of(codes), states, lambda y: jnp.stack([y[0], -y[0], y[1], -y[1]])
+        )
+        step, each = jnp.argmin(values, axis=0), jnp.arange(4)
+        begins, lengths = states[:-1, 2] - states[0, 2], jnp.diff(states[:, 2])
+        since = begins[step] + places[step, each] * lengths[step]
+        share = since / jnp.where(unknown[3] > 0, unknown[3], 1.0)
+        return jnp.stack([share, values[step, each]])
+
+    still, at = lax.stop_gradient((osc, z))
+    found = arc_by_arc(one)((still,), (chain.codes, chain.mesh, at))
+    values = jnp.where(chain.used[:, None], found[:, 1], jnp.inf)
+    arcs = jnp.argmin(values, axis=0)
+    shares = lax.stop_gradient(found[arcs, 0, jnp.arange(4)])
+
+    def state(arc, share):
+        y, duration = z[arc, :3], share * z[arc, 3]
+        return flow(osc, chain.codes[arc], chain.mesh[arc], y, duration)[:2]
+
+    states = jax.vmap(state)(arcs, shares)
+    return states[jnp.arange(4), jnp.array([0, 0, 1, 1])]
 
 
 def timed_admissible(osc: Oscillator, chain: TimedChain, z: Array) -> Array:

@@ -1,9 +1,10 @@
 """Functionals: one number of a cycle, to be swept, plotted, fitted or designed.
 
-Each takes a `Cycle` and returns a scalar that is differentiable with respect to the oscillator's
-parameters, forward and reverse, and works on batches under `jax.vmap`. All quantities are
-dimensionless: times in units of 1/omega, energies in units of k L^2 where L is the unit of length.
-Where the status of the cycle is not OK they are NaN.
+Each takes a `Cycle`, and all but `gap` and the energies take the `PeriodicMotion` of a forced
+oscillator, too, whose loop is all its periods. They return a scalar that is differentiable with
+respect to the oscillator's parameters, forward and reverse, and work on batches under `jax.vmap`.
+All quantities are dimensionless: times in units of 1/omega, energies in units of k L^2 where L is
+the unit of length. Where the status of the cycle is not OK they are NaN.
 """
 
 from collections.abc import Callable
@@ -14,18 +15,17 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..activity import announced
-from ..checks import check_belt, require_one_of, require_value
+from ..checks import check_belt, require, require_one_of, require_value
 from ..model.modes import Mode, mode_acceleration
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import jit
 from .chains import Chain
 from .cycle import Cycle
+from .periodic import PeriodicMotion
 from .shooting import flow
 
-_COORDINATES = {"x1": 0, "x2": 1}
 
-
-def period(cycle: Cycle) -> Array:
+def period(cycle: Cycle | PeriodicMotion) -> Array:
     """Duration of one loop.
 
     Args:
@@ -37,7 +37,7 @@ def period(cycle: Cycle) -> Array:
     return _checked_cycle(cycle).period
 
 
-def stick_duration(cycle: Cycle, belt: int | None = None) -> Array:
+def stick_duration(cycle: Cycle | PeriodicMotion, belt: int | None = None) -> Array:
     """Time per loop for which the mass sticks to a belt, summed over its stick phases.
 
     Args:
@@ -52,12 +52,12 @@ def stick_duration(cycle: Cycle, belt: int | None = None) -> Array:
     """
     if belt is None:
         stuck = jnp.where(_is_stuck(cycle), 1.0, 0.0)
-        return jnp.sum(cycle.unknowns[..., 2] * stuck, axis=-1)
+        return jnp.sum(_durations(cycle) * stuck, axis=-1)
     number = _belt_index(cycle, belt)
     return cycle.stick_durations[..., number]
 
 
-def slip_duration(cycle: Cycle, belt: int | None = None) -> Array:
+def slip_duration(cycle: Cycle | PeriodicMotion, belt: int | None = None) -> Array:
     """Time per loop for which the mass touches a belt and slips on it.
 
     Args:
@@ -75,10 +75,10 @@ def slip_duration(cycle: Cycle, belt: int | None = None) -> Array:
     number = _belt_index(cycle, belt)
     codes = cycle.chain.codes[..., number]
     slips = jnp.where(jnp.abs(codes) == 1, 1.0, 0.0)
-    return jnp.sum(cycle.unknowns[..., 2] * slips, axis=-1)
+    return jnp.sum(_durations(cycle) * slips, axis=-1)
 
 
-def stick_fraction(cycle: Cycle, belt: int | None = None) -> Array:
+def stick_fraction(cycle: Cycle | PeriodicMotion, belt: int | None = None) -> Array:
     """Fraction of a loop for which the mass sticks to a belt.
 
     Args:
@@ -94,7 +94,7 @@ def stick_fraction(cycle: Cycle, belt: int | None = None) -> Array:
     return stick_duration(cycle, belt) / cycle.period
 
 
-def amplitude(cycle: Cycle, coordinate: str = "x1") -> Array:
+def amplitude(cycle: Cycle | PeriodicMotion, coordinate: str = "x1") -> Array:
     """Half the difference of the largest and the smallest value of a coordinate in a loop.
 
     Args:
@@ -104,11 +104,11 @@ def amplitude(cycle: Cycle, coordinate: str = "x1") -> Array:
     Returns:
         The amplitude, dimensionless.
     """
-    values = _values(cycle, coordinate)
-    return 0.5 * (jnp.max(values, axis=-1) - jnp.min(values, axis=-1))
+    least, largest = _range(cycle, coordinate)
+    return 0.5 * (largest - least)
 
 
-def peak(cycle: Cycle, coordinate: str = "x1") -> Array:
+def peak(cycle: Cycle | PeriodicMotion, coordinate: str = "x1") -> Array:
     """Largest absolute value of a coordinate in a loop.
 
     Args:
@@ -118,7 +118,8 @@ def peak(cycle: Cycle, coordinate: str = "x1") -> Array:
     Returns:
         The peak, dimensionless.
     """
-    return jnp.max(jnp.abs(_values(cycle, coordinate)), axis=-1)
+    least, largest = _range(cycle, coordinate)
+    return jnp.maximum(jnp.abs(least), jnp.abs(largest))
 
 
 def gap(cycle: Cycle, belt: int) -> Array:
@@ -136,7 +137,7 @@ def gap(cycle: Cycle, belt: int) -> Array:
     Raises:
         ValueError: If there is no such belt.
     """
-    belt = _belt_index(cycle, belt)
+    belt = _belt_index(_without_forcing(cycle), belt)
     osc = cycle.oscillator
     boundary = osc.belts[belt].velocity / osc.omega
     return jnp.maximum(boundary - cycle.x2_max, cycle.x2_min - boundary)
@@ -154,7 +155,7 @@ def energy_fed(cycle: Cycle) -> Array:
     Returns:
         The energy, dimensionless.
     """
-    return _energies(_checked_cycle(cycle))[0]
+    return _energies(_without_forcing(cycle))[0]
 
 
 @announced("energy_dissipated")
@@ -167,7 +168,7 @@ def energy_dissipated(cycle: Cycle) -> Array:
     Returns:
         The energy, dimensionless.
     """
-    return _energies(_checked_cycle(cycle))[1]
+    return _energies(_without_forcing(cycle))[1]
 
 
 #: Quantity of each functional: the name of one of `Units`, its `coordinate`, or a number.
@@ -184,24 +185,37 @@ MEASURED_IN: dict[Callable[..., Array], str] = {
 }
 
 
-def _checked_cycle(cycle: Any) -> Cycle:
+def _checked_cycle(cycle: Any) -> Any:
     expected = "a Cycle, such as jb.find_cycle(...)"
-    require_value(isinstance(cycle, Cycle), "cycle", expected, cycle)
+    require_value(isinstance(cycle, Cycle | PeriodicMotion), "cycle", expected, cycle)
     return cycle
 
 
-def _is_stuck(cycle: Cycle) -> Array:
+def _without_forcing(cycle: Any) -> Cycle:
+    forced = isinstance(_checked_cycle(cycle), PeriodicMotion)
+    require(not forced, "cycle", "of an oscillator without forcing", "a PeriodicMotion")
+    return cycle
+
+
+def _is_stuck(cycle: Any) -> Array:
     return jnp.any(_checked_cycle(cycle).chain.codes == 0, axis=-1)
 
 
-def _belt_index(cycle: Cycle, belt: int) -> int:
+def _belt_index(cycle: Any, belt: int) -> int:
     check_belt(belt, len(_checked_cycle(cycle).oscillator.belts))
     return belt
 
 
-def _values(cycle: Cycle, coordinate: str) -> Array:
-    require_one_of(coordinate, _COORDINATES, "coordinate")
-    return _checked_cycle(cycle).unknowns[..., _COORDINATES[coordinate]]
+def _durations(cycle: Any) -> Array:
+    return cycle.unknowns[..., -1]
+
+
+def _range(cycle: Any, coordinate: str) -> tuple[Array, Array]:
+    require_one_of(coordinate, ("x1", "x2"), "coordinate")
+    cycle = _checked_cycle(cycle)
+    if coordinate == "x1":
+        return cycle.x1_min, cycle.x1_max
+    return cycle.x2_min, cycle.x2_max
 
 
 @jit

@@ -39,6 +39,7 @@ from ..tables import per_belt, require_single, table_of
 from .chains import SIZES, Loop, loop_events
 from .clocked import (
     TimedChain,
+    extremes_along,
     forcing_period,
     least_steps,
     monodromy,
@@ -98,13 +99,20 @@ class PeriodicMotion(eqx.Module):
     @property
     def periods(self) -> int:
         """After how many periods of the forcing it repeats."""
-        ends = np.asarray(self.chain.ends)
-        return int(np.max(np.sum(ends == Ends(self.chain.codes.shape[-1]).period, axis=-1)))
+        return int(np.max(np.asarray(self._period_ends)))
+
+    @property
+    def _period_ends(self) -> Array:
+        return jnp.sum(jnp.where(self.chain.ends == self._ends.period, 1.0, 0.0), axis=-1)
+
+    @property
+    def _ends(self) -> Ends:
+        return Ends(self.chain.codes.shape[-1])
 
     @property
     def period(self) -> Array:
         """Its own period, `periods` times that of the forcing."""
-        own = self.periods * forcing_period(self.oscillator, self.chain.turns)
+        own = self._period_ends * forcing_period(self.oscillator, self.chain.turns)
         return own * (0.0 * self.residual + 1.0)
 
     @property
@@ -115,8 +123,7 @@ class PeriodicMotion(eqx.Module):
     @property
     def starts(self) -> Array:
         """The states (x1, x2) at the phase 0 of each of its periods, [periods, 2]."""
-        ends = np.asarray(self.chain.ends)
-        cuts = np.flatnonzero(ends == Ends(self.chain.codes.shape[-1]).period)
+        cuts = np.flatnonzero(np.asarray(self.chain.ends) == self._ends.period)
         return self.unknowns[jnp.asarray(np.append(0, cuts[:-1] + 1)), :2]
 
     @property
@@ -124,6 +131,30 @@ class PeriodicMotion(eqx.Module):
         """Time that it sticks to each belt, [belts], in all its periods."""
         stuck = jnp.where(self.chain.codes == STUCK, 1.0, 0.0)
         return jnp.sum(self.unknowns[..., 3:] * stuck, axis=-2)
+
+    @property
+    def x1_min(self) -> Array:
+        """Smallest displacement."""
+        return self._extremes[0]
+
+    @property
+    def x1_max(self) -> Array:
+        """Largest displacement."""
+        return self._extremes[1]
+
+    @property
+    def x2_min(self) -> Array:
+        """Smallest velocity."""
+        return self._extremes[2]
+
+    @property
+    def x2_max(self) -> Array:
+        """Largest velocity."""
+        return self._extremes[3]
+
+    @property
+    def _extremes(self) -> Array:
+        return extremes_along(self.oscillator, self.chain, self.unknowns)
 
     @property
     def stable(self) -> Array:

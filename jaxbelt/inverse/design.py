@@ -1,16 +1,18 @@
-"""`design`: parameters for which a cycle meets given targets.
+"""`design`: parameters for which a cycle, or a forced periodic motion, meets given targets.
 
 Damped Newton steps on functionals of the cycle, within bounds.
 """
 
 import functools
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
@@ -27,8 +29,10 @@ from ..checks import (
     shape_in_words,
     traceable,
 )
+from ..cycles.clocked import turns_of
 from ..cycles.cycle import Cycle, cycle_from, cycle_of_zeros
-from ..model.oscillator import Oscillator, check_oscillator, refuse_clock
+from ..cycles.periodic import PeriodicMotion, motion_reached, nothing_found
+from ..model.oscillator import Oscillator, check_oscillator, frequencies, has_clock, refuse_clock
 from ..model.parameters import leaf_index
 from ..numerics.compiling import jit
 from ..results import Status, describe, draw
@@ -48,7 +52,7 @@ class Design(eqx.Module):
 
     Attributes:
         oscillator: The designed oscillator.
-        cycle: Its cycle.
+        cycle: Its cycle; of a forced one its `PeriodicMotion`.
         names: Names of the parameters, in the order of `where`.
         values: Their values, [p].
         achieved: Values of the functionals, [targets].
@@ -60,7 +64,7 @@ class Design(eqx.Module):
     """
 
     oscillator: Oscillator
-    cycle: Cycle
+    cycle: Cycle | PeriodicMotion
     names: tuple[str, ...] = eqx.field(static=True)
     values: Array
     achieved: Array
@@ -85,7 +89,7 @@ class Design(eqx.Module):
         )
 
     def plot(self, ax: Any = None) -> Any:
-        """Draws the designed cycle, see `Cycle.plot`.
+        """Draws the designed cycle, see `Cycle.plot` and `PeriodicMotion.plot`.
 
         Args:
             ax: Axes; None makes new ones.
@@ -107,20 +111,50 @@ class Design(eqx.Module):
         return "\n".join([head, *rows, *advice])
 
 
+@dataclass(frozen=True, eq=False)
+class _BifurcationMargin:
+    """What `distance_to` returns."""
+
+    conditions: tuple[AbstractCondition, ...]
+    where: Callable[[Oscillator], Any]
+
+    def check(self, osc: Oscillator) -> None:
+        """Raises a `ValueError` where an oscillator has no such parameter or condition."""
+        leaf_index(osc, self.where)
+        for condition in self.conditions:
+            condition.check(osc)
+            condition.applied_to(osc)
+
+    def __call__(self, cycle: Cycle | PeriodicMotion) -> Array:
+        osc = cycle.oscillator
+        value = jax.tree.leaves(osc)[leaf_index(osc, self.where)]
+        # Points of a forced oscillator are found from one of its motions.
+        start = cycle if isinstance(cycle, PeriodicMotion) else None
+        distances = []
+        for condition in self.conditions:
+            point = refine(condition, osc, where=self.where, start=lax.stop_gradient(start))
+            found = point.status == Status.OK
+            distances.append(
+                jnp.where(found, jnp.abs(jnp.where(found, point.value, 0.0) - value), jnp.inf)
+            )
+        return functools.reduce(jnp.minimum, distances)
+
+
 def distance_to(
     *conditions: AbstractCondition, where: Callable[[Oscillator], Any]
-) -> Callable[[Cycle], Array]:
+) -> Callable[[Cycle | PeriodicMotion], Array]:
     """A functional for `design`: distance of a parameter to the nearest of some bifurcations.
 
     Each point is found by `refine` from the oscillator of the cycle; a point that is not found
     counts as infinitely far.
 
     Args:
-        conditions: Conditions such as `jb.NonsmoothFold(belt=1)`.
+        conditions: Conditions such as `jb.NonsmoothFold(belt=1)`; for a forced oscillator those of
+            forced motions, such as `jb.PeriodDoubling()`.
         where: Selects the parameter.
 
     Returns:
-        A function of a `Cycle`.
+        A function of a `Cycle`, or of a `PeriodicMotion` (not under `jax.jit` and `jax.vmap`).
 
     Raises:
         ValueError: If there is no condition, or `where` is no function.
@@ -129,20 +163,7 @@ def distance_to(
     require(len(conditions) > 0, "conditions", "one or more, such as jb.Hopf()", "none")
     check_conditions(conditions)
     require_callable(where, "where", "a function such as `lambda osc: osc.belts[0].velocity`")
-
-    def distance(cycle: Cycle) -> Array:
-        osc = cycle.oscillator
-        value = jax.tree.leaves(osc)[leaf_index(osc, where)]
-        distances = []
-        for condition in conditions:
-            point = refine(condition, osc, where=where)
-            found = point.status == Status.OK
-            distances.append(
-                jnp.where(found, jnp.abs(jnp.where(found, point.value, 0.0) - value), jnp.inf)
-            )
-        return functools.reduce(jnp.minimum, distances)
-
-    return distance
+    return _BifurcationMargin(conditions, where)
 
 
 @announced("design")
@@ -162,15 +183,20 @@ def design(
     takes the shortest steps. The status is UNREACHABLE where no choice within the bounds meets the
     targets, and where they lie behind a bifurcation at which the cycle vanishes.
 
+    Of a forced oscillator the cycle is the stable `PeriodicMotion` that y0 leads to. It is
+    followed: each trial begins from the motion of the last one that was accepted. A trial that
+    leads to no periodic motion, as in chaos, is not accepted.
+
     Args:
         oscillator: The oscillator to begin with; it needs a cycle.
         targets: Pairs of a functional of the `Cycle`, such as `jb.amplitude` or `lambda c:
             jb.stick_duration(c, 1)`, and its value, or an interval (lower, upper). The functional
             `distance_to` keeps a bifurcation away; `distance_to_basin_boundary` lets the cycle
-            withstand shocks.
+            withstand shocks (without forcing only). Of a forced motion `lambda motion:
+            abs(motion.multipliers[0])` is how much it attracts.
         where: Selects the parameters that may change, as for `fit`.
         bounds: Their bounds, as for `fit`.
-        y0: Start (x1, x2) that leads to the cycle, shape [2].
+        y0: Start (x1, x2) that leads to the cycle, shape [2]; of a forced oscillator at t = 0.
         report: Function that is called with lines on the progress, such as `print`.
 
     Returns:
@@ -180,7 +206,6 @@ def design(
         ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(oscillator, "oscillator")
-    refuse_clock(oscillator, "design", "jax.grad of jb.simulate")
     y0 = as_array(y0, "y0", (2,))
     check_finite(y0, "y0")
     functionals, intervals = _checked_targets(targets)
@@ -188,12 +213,18 @@ def design(
         _check_functional(functional, oscillator)
     note = progress_reporter(report)
     selection, u = selection_of(oscillator, where, bounds)
+    _check_frequencies(oscillator, selection, u)
 
-    def evaluate(u):
+    def evaluate(u, y0):
         u = jnp.asarray(u)
         beside = selection.put(oscillator, selection.values(u))
         ready = tuple(f.at(beside, y0) if isinstance(f, BasinMargin) else f for f in functionals)
-        return _achieved(ready, selection, oscillator, y0, u)
+        # Forced motions are found outside of programs.
+        achieved = _achieved if has_clock(oscillator) else _achieved_in_one
+        return achieved(ready, selection, oscillator, y0, u)
+
+    def start_of(cycle):
+        return cycle.start if isinstance(cycle, PeriodicMotion) else y0
 
     def off(achieved):
         wanted = np.clip(achieved, *intervals.T)
@@ -207,7 +238,7 @@ def design(
         step = -matrix.T @ np.linalg.solve(gram + damping * np.eye(len(miss)), miss)
         return u + step * min(1.0, LONGEST_CHANGE / max(np.max(np.abs(step)), 1e-300))
 
-    achieved, slopes, cycle = evaluate(u)
+    achieved, slopes, cycle = evaluate(u, y0)
     # The unit of a miss is the largest known number of its target.
     known = np.column_stack([np.asarray(achieved), intervals])
     sizes = np.max(np.abs(np.where(np.isfinite(known), known, 0.0)), axis=1)
@@ -218,7 +249,7 @@ def design(
         if not np.all(np.isfinite(miss)) or np.max(np.abs(miss)) < MET or damping > 1e8:
             break
         new = improved(np.asarray(slopes), miss, damping)
-        trial = evaluate(new)
+        trial = evaluate(new, start_of(cycle))
         new_miss, new_wanted = off(np.asarray(trial[0]))
         iterations += 1
         gain = 1 - np.linalg.norm(new_miss) / np.linalg.norm(miss)
@@ -243,12 +274,12 @@ def design(
     )
 
 
-@jit
 def _achieved(functionals, selection: Selection, osc: Oscillator, y0, u):
     """Functionals of the cycle (NaN where there is none), their derivatives, and the cycle."""
+    reached = motion_reached if has_clock(osc) else cycle_from
 
     def achieved(u):
-        cycle = cycle_from(selection.put(osc, selection.values(u)), y0)
+        cycle = reached(selection.put(osc, selection.values(u)), y0)
         values = jnp.stack([functional(cycle) for functional in functionals])
         values = jnp.where(cycle.status == Status.OK, values, jnp.nan)
         return values, (values, cycle)
@@ -257,18 +288,42 @@ def _achieved(functionals, selection: Selection, osc: Oscillator, y0, u):
     return values, slopes, cycle
 
 
-def _check_functional(functional: Callable[[Cycle], Any], osc: Oscillator) -> None:
+_achieved_in_one = jit(_achieved)
+
+
+def _check_functional(functional: Callable[[Any], Any], osc: Oscillator) -> None:
     """Raises a `ValueError` unless a functional returns one number for a cycle."""
     if isinstance(functional, BasinMargin):
-        return
+        return refuse_clock(osc, "distance_to_basin_boundary")
+    if isinstance(functional, _BifurcationMargin) and has_clock(osc):
+        return functional.check(osc)
     field, expected = "functional of targets", "a function of a cycle that returns one number"
-
-    def tried(osc: Oscillator) -> Any:
-        return functional(cycle_of_zeros(osc))
-
-    value = traceable(lambda: jax.eval_shape(tried, osc), field, expected)
+    tried, numbers = _on_no_cycle(functional, osc)
+    value = traceable(lambda: jax.eval_shape(tried, *numbers), field, expected)
     fits = isinstance(value, jax.ShapeDtypeStruct) and value.shape == ()
     require(fits, field, expected, f"one that returns {shape_in_words(value)}")
+
+
+def _on_no_cycle(functional: Callable[[Any], Any], osc: Oscillator) -> tuple[Callable, tuple]:
+    """A functional of something with the shapes of a cycle, as a function of numbers, and these."""
+    if not has_clock(osc):
+        return lambda osc: functional(cycle_of_zeros(osc)), (osc,)
+    nothing = nothing_found(osc, turns_of(osc), Status.NOT_SETTLED.value)
+
+    def tried(osc, unknowns, multipliers, residual):
+        numbers = dict(unknowns=unknowns, multipliers=multipliers, residual=residual)
+        return functional(replace(nothing, oscillator=osc, **numbers))
+
+    return tried, (osc, nothing.unknowns, nothing.multipliers, nothing.residual)
+
+
+def _check_frequencies(osc: Oscillator, selection: Selection, u: np.ndarray) -> None:
+    """Raises a `ValueError` if frequencies that have a period in common are changed apart."""
+    moved = selection.put(osc, selection.values(jnp.asarray(u + 1e-3 * np.arange(1, u.size + 1))))
+    before, after = (np.array(list(map(float, frequencies(one)))) for one in (osc, moved))
+    fits = np.allclose(before * after[:1], after * before[:1], rtol=1e-14, atol=0)
+    expected = "such that all frequencies keep a period in common"
+    require(fits, "where", expected, f"{', '.join(selection.names)}, which change them apart")
 
 
 def _checked_targets(targets):

@@ -33,7 +33,9 @@ def _check_found(result: Cycle | BifurcationPoint, name: str) -> None:
 
 
 def plot_design(design: Design, ax: Axes | None = None) -> Axes:
-    """Draws the designed cycle."""
+    """Draws the designed cycle, or forced motion."""
+    if isinstance(design.cycle, PeriodicMotion):
+        return plot_motion(design.cycle, ax)
     return plot_cycle(design.cycle, ax)
 
 
