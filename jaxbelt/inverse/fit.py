@@ -34,13 +34,13 @@ from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
 from ..checks import as_array, as_whole, check_finite, outside_of_traces, require, require_value
-from ..model.oscillator import Oscillator, check_oscillator, refuse_clock
+from ..model.oscillator import Oscillator, check_oscillator
 from ..model.own_units import in_own_units, own_length, quantity, rescaled
 from ..motion.simulate import simulate
 from ..numerics.compiling import jit
 from ..results import Status, describe, draw
 from ..tables import table_of
-from .record import OVERESTIMATED, WINDOW, Record, Verdict, record_of, verdict_on
+from .record import OVERESTIMATED, WINDOW, Record, Verdict, quickest, record_of, verdict_on
 from .search import first_guesses
 from .selection import (
     ITERATIONS,
@@ -90,12 +90,15 @@ def _linearized(selection: Selection, osc: Oscillator, record: Record, u, starts
         moved = in_own_units(selection.put(osc, selection.values(u)), record.length)
 
         def piece(y, row):
-            times, start, is_fresh = row
+            times, clock, start, is_fresh = row
             y = jnp.where(is_fresh, start, y)
+            # Without forcing every piece begins at 0.
+            t0, times = (0.0, times) if clock is None else (clock[0], clock)
             run = simulate(
                 moved,
                 y,
                 times[-1],
+                t0=t0,
                 ts=times,
                 rtol=TOLERANCE,
                 atol=TOLERANCE,
@@ -103,7 +106,8 @@ def _linearized(selection: Selection, osc: Oscillator, record: Record, u, starts
             )
             return run.ys[-1], run.ys[:-1]
 
-        return lax.scan(piece, starts[0], (record.times, starts, fresh))[1]
+        rows = record.times, record.clock, starts, fresh
+        return lax.scan(piece, starts[0], rows)[1]
 
     p, pieces = u.size, starts.shape[0]
     du = jnp.concatenate([jnp.eye(p), jnp.zeros((2, p))])
@@ -403,16 +407,16 @@ def fit(
         ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(oscillator, "oscillator")
-    refuse_clock(oscillator, "fit", "jax.grad of jb.simulate")
     times, values, sigmas = _checked_record(ts, x1, x2, noise)
     starts = as_whole(starts, "starts")
     note = progress_reporter(report)
-    selection, u = selection_of(oscillator, where, bounds)
+    until = float(np.max(np.abs(times)))
+    selection, u = selection_of(oscillator, where, bounds, until)
 
     # The record and its motions are in the own units of the guess.
     length = float(own_length(oscillator))
     values, sigmas = values / length, [one if one is None else one / length for one in sigmas]
-    record = record_of(times, values, sigmas, length)
+    record = record_of(times, values, sigmas, length, oscillator)
     evaluations = 0
 
     def linearized(u, starts, fresh):
@@ -423,7 +427,8 @@ def fit(
     data = int(np.sum(np.isfinite(values)))
     freedom = data - u.size - 2
     require(freedom > 0, "ts", f"more data than the {u.size + 2} unknowns", data)
-    note(f"search: {starts} starts, {len(record.starts)} windows of {WINDOW} time units")
+    window = f"{WINDOW / quickest(oscillator):.3g}"
+    note(f"search: {starts} starts, {len(record.starts)} windows of {window} time units")
     estimated = any(
         sigma is None and np.any(np.isfinite(column))
         for sigma, column in zip(sigmas, values.T, strict=True)

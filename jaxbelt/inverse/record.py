@@ -11,8 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-#: Length of the first windows, less than half a loop: no phase is lost over it.
-WINDOW = 2.5
+from ..model.oscillator import Oscillator, frequencies, has_clock
+
+#: Length of the first windows, less than half a loop: no phase is lost over it. Data count as near
+#: to each other within a third of a time unit. With faster forcing both are shorter.
+WINDOW, NEAR = 2.5, 0.35
 #: Noise alone makes a fit as bad as this once in a million records.
 IMPLAUSIBLE = 1e-6
 #: Residuals with a larger autocorrelation, in units of 1/sqrt(data), are not noise.
@@ -34,6 +37,7 @@ class Record(eqx.Module):
         lacks: 1.0 where only velocities are known, so that the x1 of all starts lack a common
             constant, else 0.0.
         length: Unit of length of all of these.
+        clock: `times` as the times of the forcing; None without forcing.
     """
 
     times: Array
@@ -43,10 +47,15 @@ class Record(eqx.Module):
     scale: Array
     lacks: Array
     length: Array
+    clock: Array | None = None
 
 
 def record_of(
-    ts: np.ndarray, values: np.ndarray, noise: Sequence[float | None], length: float
+    ts: np.ndarray,
+    values: np.ndarray,
+    noise: Sequence[float | None],
+    length: float,
+    osc: Oscillator,
 ) -> Record:
     """Cuts a record into pieces.
 
@@ -55,13 +64,15 @@ def record_of(
         values: x1 and x2, [samples, 2], NaN where there is no datum.
         noise: Standard deviations for x1 and x2; None is estimated.
         length: Unit of length of values and noise.
+        osc: The oscillator whose motion it is thought to be.
     """
     n = len(ts)
     step = (ts[-1] - ts[0]) / (n - 1)
-    size = int(np.clip(round(WINDOW / step), 1, n))
+    quick = quickest(osc)
+    size = int(np.clip(round(WINDOW / quick / step), 1, n))
     pieces = -(-n // size)
     begin = np.arange(pieces) * size
-    smoothed = [local_cubics(ts, column) for column in values.T]
+    smoothed = [local_cubics(ts, column, NEAR / quick) for column in values.T]
     known = np.isfinite(values)
     given = [i for i in (0, 1) if np.any(known[:, i])]
     if 0 in given:
@@ -79,29 +90,38 @@ def record_of(
         weights[:, i] = np.where(known[:, i], 1 / sigma, 0.0)
 
     missing = pieces * size - n
-    ts = np.concatenate([ts, np.full(missing, ts[-1]), [ts[-1] + step]])
     padding = ((0, missing), (0, 0))
+    ts = np.concatenate([ts, np.full(missing, ts[-1]), [ts[-1] + step]])
+    clock = np.stack([ts[i : i + size + 1] for i in begin])
     return Record(
-        times=jnp.asarray(np.stack([ts[i : i + size + 1] - ts[i] for i in begin])),
+        times=jnp.asarray(clock - clock[:, :1]),
         values=jnp.asarray(np.pad(np.where(known, values, 0.0), padding).reshape(pieces, size, 2)),
         weights=jnp.asarray(np.pad(weights, padding).reshape(pieces, size, 2)),
         starts=jnp.asarray(states[begin]),
         scale=jnp.asarray(np.std(states, axis=0)),
         lacks=jnp.asarray(float(0 not in given)),
         length=jnp.asarray(np.float64(length)),
+        clock=jnp.asarray(clock) if has_clock(osc) else None,
     )
 
 
-def local_cubics(ts: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+def quickest(osc: Oscillator) -> float:
+    """The highest frequency of the forcing; at least 1, the natural frequency."""
+    return max([1.0, *map(float, frequencies(osc))])
+
+
+def local_cubics(
+    ts: np.ndarray, column: np.ndarray, near: float = NEAR
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Local cubic through the data near every time: its value and slope there, and the noise.
 
-    Near means a third of a time unit on either side, and at least seven data.
+    Near means so much time on either side, and at least seven data.
     """
     known = np.isfinite(column)
     if np.sum(known) < 7:
         return np.zeros_like(ts), np.zeros_like(ts), np.nan
     t, x = ts[known], column[known]
-    half = max(3, round(0.35 / np.median(np.diff(t))))
+    half = max(3, round(near / np.median(np.diff(t))))
     half = min(half, (len(t) - 1) // 2)
     centre = np.searchsorted(t, ts)
     rows = np.clip(centre - half, 0, len(t) - 2 * half - 1)[:, None] + np.arange(2 * half + 1)

@@ -16,11 +16,11 @@ import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
-from ..model.oscillator import Oscillator
+from ..model.oscillator import Oscillator, at_time
 from ..model.own_units import in_own_units
 from ..motion.smoothing import smooth_field
 from ..numerics.compiling import jit
-from .record import Record
+from .record import Record, quickest
 from .selection import Selection
 
 #: Steps of the search, and its learning rate in units of a parameter's size.
@@ -46,11 +46,13 @@ def _smooth_misfit(unknown, selection: Selection, osc: Oscillator, record: Recor
         k4 = field(ahead(k3, 1.0))
         slope = tuple((a + 2 * b + 2 * c + d) / 6 for a, b, c, d in zip(k1, k2, k3, k4))
         new = ahead(slope, 1.0)
-        return new, jnp.stack(new, axis=-1)
+        return new, jnp.stack(new[:2], axis=-1)
 
     start = (record.starts[:, 0] + shift * record.lacks, record.starts[:, 1])
+    if record.clock is not None:
+        start = (*start, record.clock[:, 0])
     _, path = lax.scan(advance, start, None, length=steps)
-    path = jnp.concatenate([jnp.stack(start, axis=-1)[None], path])
+    path = jnp.concatenate([jnp.stack(start[:2], axis=-1)[None], path])
     # Linear interpolation between steps at the times of the data is accurate enough here.
     at = jnp.clip(record.times[:, :-1] / h[:, None], 0.0, steps)
     before = jnp.minimum(at.astype(int), steps - 1)
@@ -105,9 +107,10 @@ def first_guesses(
     # stable up to 2.8 over the slope of the friction; two belts with one velocity double that
     # slope.
     eps = 0.1 * max(float(record.scale[1]), 0.1 * float(record.scale[0]))
-    belts = in_own_units(osc, record.length).belts
-    slope = max(float(belt.load * belt.friction.static) for belt in belts) / eps
-    steps = 16 * int(np.ceil(float(jnp.max(record.times)) * max(20.0, slope / 1.3) / 16))
+    belts = at_time(in_own_units(osc, record.length), record.clock).belts
+    slope = max(np.max(belt.load * belt.friction.static) for belt in belts) / eps
+    rate = max(20.0 * quickest(osc), slope / 1.3)
+    steps = 16 * int(np.ceil(float(jnp.max(record.times)) * rate / 16))
     rng = np.random.default_rng(0)
     spread = rng.standard_normal((starts, u.size + 1))
     spread[0] = 0.0

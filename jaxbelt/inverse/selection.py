@@ -1,6 +1,7 @@
 """Parameters that an inverse problem may change, and their bounds."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -11,7 +12,7 @@ from jaxtyping import Array, ArrayLike
 
 from ..activity import note_progress
 from ..checks import as_numbers, require, require_value
-from ..model.oscillator import Oscillator
+from ..model.oscillator import Oscillator, has_clock, waves_of
 from ..model.parameters import leaf_groups, names_of
 from ..model.variations import Variation
 
@@ -26,7 +27,8 @@ class Selection(eqx.Module):
 
     Each parameter is a function of an unbounded variable u: lower + unit exp(u) or upper - unit
     exp(-u) with one bound, a logistic function of u between two bounds, and size u without bounds.
-    unit is the parameter's own, see `Variation.in_own_units`.
+    unit is the parameter's own, see `Variation.in_own_units`. stretch: by which u is multiplied
+    before; None: nothing is.
     """
 
     leaves: tuple[tuple[int, ...], ...] = eqx.field(static=True)
@@ -35,8 +37,10 @@ class Selection(eqx.Module):
     upper: Array
     size: Array
     unit: Array
+    stretch: Array | None = None
 
     def values(self, u: Array) -> Array:
+        u = u if self.stretch is None else u * self.stretch
         has_lower, has_upper = jnp.isfinite(self.lower), jnp.isfinite(self.upper)
         low, high = jnp.where(has_lower, self.lower, 0.0), jnp.where(has_upper, self.upper, 0.0)
         unit = self.unit
@@ -50,7 +54,8 @@ class Selection(eqx.Module):
         has_lower, has_upper = jnp.isfinite(self.lower), jnp.isfinite(self.upper)
         above = jnp.log(jnp.where(has_lower, (values - self.lower) / self.unit, 1.0))
         below = -jnp.log(jnp.where(has_upper, (self.upper - values) / self.unit, 1.0))
-        return jnp.where(has_lower | has_upper, above + below, values / self.size)
+        u = jnp.where(has_lower | has_upper, above + below, values / self.size)
+        return u if self.stretch is None else u / self.stretch
 
     def put(self, osc: Oscillator, values: Array) -> Oscillator:
         """The oscillator with the parameters set to these values."""
@@ -78,10 +83,14 @@ def progress_reporter(report: Callable[[str], None] | None) -> Callable[[str], N
     return both
 
 
-def selection_of(osc: Oscillator, where: Callable, bounds) -> tuple[Selection, np.ndarray]:
+def selection_of(
+    osc: Oscillator, where: Callable, bounds, until: float | None = None
+) -> tuple[Selection, np.ndarray]:
     """The parameters that `where` selects, and their u.
 
-    A parameter is a leaf, or a tuple of leaves that are kept equal.
+    A parameter is a leaf, or a tuple of leaves that are kept equal. until: the time up to which the
+    forcing matters. Then frequencies and phases are measured by what they do: where u changes by 1
+    no wave is shifted by more than a radian, at any time.
     """
     groups, leaves = leaf_groups(osc, where), jax.tree.leaves(osc)
     named = names_of(osc)
@@ -100,7 +109,23 @@ def selection_of(osc: Oscillator, where: Callable, bounds) -> tuple[Selection, n
     units = own_units_of(osc, names)
     size = jnp.asarray(parameter_sizes(values, units))
     selection = Selection(groups, names, lower, upper, size, jnp.asarray(units))
-    return selection, np.asarray(selection.unbounded(jnp.asarray(values)))
+    u = selection.unbounded(jnp.asarray(values))
+    if until is not None and has_clock(osc):
+        shifts = _shifts(osc, selection, u, until)
+        stretch = 1 / jnp.where(shifts > 0, shifts, 1.0)
+        selection, u = replace(selection, stretch=stretch), u / stretch
+    return selection, np.asarray(u)
+
+
+def _shifts(osc: Oscillator, selection: Selection, u: Array, until: float) -> Array:
+    """By how much u = 1 shifts the waves of the forcing up to a time, at most, in radians, [p]."""
+
+    def angles(u):
+        waves = waves_of(selection.put(osc, selection.values(u)))
+        phases = [getattr(wave, "phase", jnp.zeros(())) for wave in waves]
+        return jnp.stack([until * wave.frequency for wave in waves] + phases)
+
+    return jnp.max(jnp.abs(jax.jacfwd(angles)(u)), axis=0)
 
 
 def parameter_sizes(values: ArrayLike, units: ArrayLike) -> np.ndarray:

@@ -273,11 +273,16 @@ def check_clock(osc: Any, name: str, instead: str) -> None:
         require(False, "osc", expected, "one without forcing")
 
 
-def frequencies(osc: Oscillator) -> list[Array]:
-    """Angular frequencies of all that knows the time: forces, then velocities and loads."""
-    forces = [one.frequency for one in osc.forcing if not isinstance(one, ConstantForce)]
+def waves_of(osc: Oscillator) -> list[Any]:
+    """All that knows the time: forces, then velocities and loads."""
+    forces = [one for one in osc.forcing if not isinstance(one, ConstantForce)]
     waves = [wave for belt in osc.belts for wave in (belt.velocity, belt.load)]
-    return forces + [wave.frequency for wave in waves if isinstance(wave, Oscillating)]
+    return forces + [wave for wave in waves if isinstance(wave, Oscillating)]
+
+
+def frequencies(osc: Oscillator) -> list[Array]:
+    """Angular frequencies of all that knows the time, as in `waves_of`."""
+    return [wave.frequency for wave in waves_of(osc)]
 
 
 def fastest(osc: Oscillator) -> Array:
