@@ -23,10 +23,12 @@ from .bifurcations.diagrams import BifurcationDiagram
 from .checks import in_words, outside_of_traces, require
 from .cycles.cycle import Cycle
 from .cycles.functionals import energy_dissipated
+from .cycles.periodic import PeriodicMotion
 from .cycles.portrait import Portrait
 from .cycles.shocks import FatalShock
 from .inverse.fit import Fit
 from .model.equilibria import Equilibria
+from .model.forcing import BaseMotion, ConstantForce, Harmonic
 from .model.friction import LawInUnits
 from .model.machine import Machine, Units
 from .model.modes import STUCK, mode_acceleration, mode_of, stick_rate
@@ -59,6 +61,8 @@ UNITS_OF_FIELDS: dict[str, tuple[str, Callable[[Units], Any]]] = {
     "velocity": ("m s-1", lambda units: units.velocity),
     "load": ("N", lambda units: units.force),
     **dict.fromkeys(("lower", "upper"), ("m", lambda units: units.length)),
+    "frequency": ("rad s-1", lambda units: 1 / units.time),
+    "phase": ("rad", lambda units: jnp.ones_like(units.time)),
 }
 #: Relative accuracy to which a number of a friction law has to follow a power of the unit of speed.
 POWER_ROUNDING = 1e-12
@@ -89,6 +93,7 @@ def in_si(
     result: Union[
         Trajectory,
         Cycle,
+        PeriodicMotion,
         Portrait,
         FatalShock,
         Basins,
@@ -110,7 +115,8 @@ def in_si(
       limit of a jump of the force from the left is no sample); `t_event`, `x1_event`, `x2_event`,
       `event_kind` and `event_belt`.
     - a cycle: `period`, `stick_duration` of each belt, `x1_min`, `x1_max`, `x2_min`, `x2_max`,
-      `amplitude`, and `energy`, which friction and dashpot turn into heat in one period.
+      `amplitude`, and `energy`, which friction and dashpot turn into heat in one period (not of a
+      forced motion).
     - a portrait: over `row`, the columns of its `table()`, `rate` in 1/s.
     - a shock: `x1` and `x2` of its start, `shock_x1`, `shock_x2`, and `distance`, in m/s where it
       changes the velocity alone. A distance that combines both stays dimensionless.
@@ -118,12 +124,14 @@ def in_si(
     - a fit: over `parameter`, the names in its table, `estimate`, `standard_error`, `lower` and
       `upper` (the confidence interval of 95 per cent), each in the `unit` beside it (a `load` is
       the normal force). A parameter of a user's friction law is in the power of m/s that follows
-      from the law's `in_units_of`, or stays as the law has it, with the unit "". Over `t`: the
-      fitted motion, `x1` and `x2`, and `x1_residual` and `x2_residual`, datum minus motion.
+      from the law's `in_units_of`, or stays as the law has it, with the unit ""; so does one of a
+      user's force. Over `t`: the fitted motion, `x1` and `x2`, and `x1_residual` and `x2_residual`,
+      datum minus motion.
     - a diagram, or fractions: over `row`, the columns of its `table()`; a special point is a row
       with the branch -1. `value`, of the parameter, is in m/s for the velocity of a belt, in N for
-      a load (the normal force), in m for a contact edge, in N s/m for the damping; the argument of
-      a function stays as the function takes it.
+      a load (the normal force), in m for a contact edge, in N s/m for the damping, in N (of a
+      support in m), rad/s or rad for the forcing; the argument of a function stays as the function
+      takes it.
     - a dataset: its own variables, with derivatives by starts and parameters where the units are
       the same in all runs. Results of a user's observable stay dimensionless, and so does the
       attribute `start`; the words for `label` of basins say in m where the mass rests.
@@ -135,9 +143,9 @@ def in_si(
     instead.
 
     Args:
-        result: A result for the machine's oscillator: a `Trajectory`, a `Cycle`, a `Portrait`, a
-            `FatalShock`, `Basins`, `BasinStability`, a `Fit`, a `BifurcationDiagram`, an
-            `OrbitDiagram`, `BasinFractions`, or the dataset of a sweep.
+        result: A result for the machine's oscillator: a `Trajectory`, a `Cycle`, a
+            `PeriodicMotion`, a `Portrait`, a `FatalShock`, `Basins`, `BasinStability`, a `Fit`, a
+            `BifurcationDiagram`, an `OrbitDiagram`, `BasinFractions`, or the dataset of a sweep.
         machine: The `Machine`. Where a sweep has axes other than starts, or a function was given in
             place of an oscillator: a function of these that returns the machine, as its units may
             differ from run to run. `machine.units` in place of the machine only converts and
@@ -159,7 +167,7 @@ def in_si(
     match result:
         case Trajectory():
             return _trajectory(result, one)
-        case Cycle():
+        case Cycle() | PeriodicMotion():
             return _cycle(result, one)
         case Portrait():
             return _of_portrait(result, one)
@@ -180,8 +188,9 @@ def in_si(
             require(not is_done, "result", "dimensionless", "a dataset that is in SI units")
             return _dataset(result, machine)
     raise TypeError(
-        "result must be a Trajectory, a Cycle, a Portrait, a FatalShock, Basins, BasinStability, "
-        "a Fit, a BifurcationDiagram, an OrbitDiagram, BasinFractions, or the dataset of a sweep, "
+        "result must be a Trajectory, a Cycle, a PeriodicMotion, a Portrait, a FatalShock, Basins, "
+        "BasinStability, a Fit, a BifurcationDiagram, an OrbitDiagram, BasinFractions, or the "
+        "dataset of a sweep, "
         f"got {type(result).__name__}{INSTEAD.get(type(result), '')}"
     )
 
@@ -225,7 +234,7 @@ def check_machine(result: Any, machine: Any) -> None:
         case Fit():
             osc = result.oscillator
             free = {name for tied in result.names for name in tied.split(" = ")}
-        case Cycle() | Basins() | Portrait():
+        case Cycle() | PeriodicMotion() | Basins() | Portrait():
             osc = result.oscillator
         case FatalShock():
             osc = result.portrait.oscillator
@@ -346,7 +355,7 @@ def _check_belts(run: Trajectory, machine: Any) -> None:
             require(False, "result", expected, came)
 
 
-def _cycle(cycle: Cycle, machine: Machine | Units) -> "xarray.Dataset":
+def _cycle(cycle: Cycle | PeriodicMotion, machine: Machine | Units) -> "xarray.Dataset":
     import xarray
 
     units = units_of(machine)
@@ -360,8 +369,9 @@ def _cycle(cycle: Cycle, machine: Machine | Units) -> "xarray.Dataset":
         "x2_min": ((), cycle.x2_min, "smallest velocity"),
         "x2_max": ((), cycle.x2_max, "largest velocity"),
         "amplitude": ((), (cycle.x1_max - cycle.x1_min) / 2, "half of the span of displacement"),
-        "energy": ((), energy_dissipated(cycle), "energy dissipated in one period"),
     }
+    if isinstance(cycle, Cycle):
+        variables["energy"] = ((), energy_dissipated(cycle), "energy dissipated in one period")
     found = {
         name: _variable(dims, values, name, units, long_name)
         for name, (dims, values, long_name) in variables.items()
@@ -428,11 +438,26 @@ def _unit_of(name: str, osc: Oscillator, units: Units) -> tuple[str, float]:
     for path in name.split(" = "):
         if ".friction." in path:
             found.add(_unit_in_law(path, osc, units))
-        else:
-            symbol, size = UNITS_OF_FIELDS[path.rpartition(".")[2]]
-            found.add((symbol, float(size(units))))
+            continue
+        field = _field_of(path, osc)
+        symbol, size = UNITS_OF_FIELDS[field] if field else ("", lambda units: 1.0)
+        found.add((symbol, float(size(units))))
     require(len(found) == 1, "result", "of tied parameters with one unit", name)
     return found.pop()
+
+
+def _field_of(path: str, osc: Oscillator) -> str:
+    """The field in `UNITS_OF_FIELDS` that a number is measured like; "" for one of a user's force,
+    whose unit only its author knows."""
+    owner, _, field = path.rpartition(".")
+    if not path.startswith("forcing["):
+        return owner.rpartition(".")[2] if field in ("mean", "amplitude") else field
+    force = osc.forcing[int(path.removeprefix("forcing[").partition("]")[0])]
+    if not isinstance(force, Harmonic | BaseMotion | ConstantForce):
+        return ""
+    if field == "amplitude":
+        return "lower" if isinstance(force, BaseMotion) else "load"
+    return field
 
 
 def _unit_in_law(path: str, osc: Oscillator, units: Units) -> tuple[str, float]:
@@ -516,7 +541,7 @@ def units_along(
     name, belts = result.name, len(osc.belts)
     belt = name.removeprefix("belts[").partition("]")[0] if name.startswith("belts[") else "0"
     require(int(belt) < belts, "machine", f"of a belt {belt}, of which result is", f"{belts} belts")
-    known = "the velocity, load, edges or law of a belt, or the damping"
+    known = "the velocity, load, edges or law of a belt, the damping or the forcing"
     require(name != "omega", "result", f"along {known}", "one along omega, 1 in every machine")
     return units, _unit_of(name, osc, units)
 

@@ -29,6 +29,7 @@ OSC = r"osc must be an Oscillator, such as jb.presets.class_b\(...\), got "
 SELECTS = "where must be a function that selects one parameter of an oscillator with belts 0 to 1"
 PAIR = r"must be \(first, last\), two numbers with first < last, got "
 CYCLE = r"cycle must be a Cycle, such as jb.find_cycle\(...\), got "
+UNFORCED = "cycle must be of an oscillator without forcing, got a PeriodicMotion"
 WHOLE = "must be a positive integer, got "
 POINT = r"point must be a BifurcationPoint, such as jb.refine\(...\), got "
 TARGETS = r"targets must be a list of pairs \(functional, value\), such as .* got "
@@ -562,6 +563,20 @@ MISTAKES = [
         "jb.design(osc, [(lambda c: math.sqrt(c.period), 1.0)], where=nu0)",
         "functional of targets must be .* made of what JAX can trace",
     ),
+    ("jb.design(forced, [(jb.energy_fed, 1.0)], where=lambda o: o.damping)", UNFORCED),
+    ("jb.design(forced, [(lambda m: jb.gap(m, 0), 1.0)], where=lambda o: o.damping)", UNFORCED),
+    (
+        "jb.design(forced, [(jb.distance_to_basin_boundary(), 1.0)], where=lambda o: o.damping)",
+        "osc must be without a clock: distance_to_basin_boundary is for oscillators that do not",
+    ),
+    (
+        "jb.fit(forced, row, row, where=lambda o: o.forcing[1].phase)",
+        "where must be a function that selects parameters",
+    ),
+    (
+        "jb.fit(forced, row, row, where=lambda o: o.forcing[0].frequency, bounds=[(2.0, 3.0)])",
+        r"forcing\[0\].frequency must be inside of its bounds \(2, 3\), got 1.7",
+    ),
     # --- in jit, vmap or derivatives
     ("jax.jit(lambda osc: jb.scan(osc, nu0, (0.1, 0.7)))(osc)", "osc" + TRACED),
     ("jax.vmap(lambda end: jb.scan(osc, nu0, (0.1, end)))(row)", "span" + TRACED),
@@ -820,6 +835,7 @@ def names() -> dict:
         "of_one": jb.Cycle(one, *[None] * 5, jnp.asarray(0)),
         "run": jb.Trajectory(*[None] * 5, jnp.asarray(0)),
         "edged": jb.presets.class_c(0.1, 0.3, 0.2),
+        "forced": jb.presets.di_bernardo(1.7),
         "dataset": xr.Dataset({"kind": ("nu0", [0])}),
         "failed": failed,
         "key": jax.random.key(0),

@@ -5,7 +5,7 @@ Damped Newton steps on functionals of the cycle, within bounds.
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -213,7 +213,8 @@ def design(
         _check_functional(functional, oscillator)
     note = progress_reporter(report)
     selection, u = selection_of(oscillator, where, bounds)
-    _check_frequencies(oscillator, selection, u)
+    if has_clock(oscillator):
+        _check_frequencies(oscillator, selection, u)
 
     def evaluate(u, y0):
         u = jnp.asarray(u)
@@ -298,23 +299,20 @@ def _check_functional(functional: Callable[[Any], Any], osc: Oscillator) -> None
     if isinstance(functional, _BifurcationMargin) and has_clock(osc):
         return functional.check(osc)
     field, expected = "functional of targets", "a function of a cycle that returns one number"
-    tried, numbers = _on_no_cycle(functional, osc)
-    value = traceable(lambda: jax.eval_shape(tried, *numbers), field, expected)
+    shaped = _motion_of_zeros(osc) if has_clock(osc) else cycle_of_zeros
+
+    def tried(osc: Oscillator) -> Any:
+        return functional(shaped(osc))
+
+    value = traceable(lambda: jax.eval_shape(tried, osc), field, expected)
     fits = isinstance(value, jax.ShapeDtypeStruct) and value.shape == ()
     require(fits, field, expected, f"one that returns {shape_in_words(value)}")
 
 
-def _on_no_cycle(functional: Callable[[Any], Any], osc: Oscillator) -> tuple[Callable, tuple]:
-    """A functional of something with the shapes of a cycle, as a function of numbers, and these."""
-    if not has_clock(osc):
-        return lambda osc: functional(cycle_of_zeros(osc)), (osc,)
-    nothing = nothing_found(osc, turns_of(osc), Status.NOT_SETTLED.value)
-
-    def tried(osc, unknowns, multipliers, residual):
-        numbers = dict(unknowns=unknowns, multipliers=multipliers, residual=residual)
-        return functional(replace(nothing, oscillator=osc, **numbers))
-
-    return tried, (osc, nothing.unknowns, nothing.multipliers, nothing.residual)
+def _motion_of_zeros(osc: Oscillator) -> Callable[[Oscillator], PeriodicMotion]:
+    """As `cycle_of_zeros`, for oscillators like a forced one."""
+    turns = turns_of(osc)
+    return lambda osc: nothing_found(osc, turns, Status.OK.value)
 
 
 def _check_frequencies(osc: Oscillator, selection: Selection, u: np.ndarray) -> None:

@@ -107,8 +107,9 @@ def first_guesses(
     # stable up to 2.8 over the slope of the friction; two belts with one velocity double that
     # slope.
     eps = 0.1 * max(float(record.scale[1]), 0.1 * float(record.scale[0]))
-    belts = at_time(in_own_units(osc, record.length), record.clock).belts
-    slope = max(np.max(belt.load * belt.friction.static) for belt in belts) / eps
+    own = in_own_units(osc, record.length)
+    now = own if record.clock is None else at_time(own, record.clock)
+    slope = max(np.max(belt.load * belt.friction.static) for belt in now.belts) / eps
     rate = max(20.0 * quickest(osc), slope / 1.3)
     steps = 16 * int(np.ceil(float(jnp.max(record.times)) * rate / 16))
     rng = np.random.default_rng(0)
