@@ -23,6 +23,7 @@ All derivatives of stages 2 and 3 are those of `simulate`, through every stick, 
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -34,7 +35,7 @@ from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
 from ..checks import as_array, as_whole, check_finite, outside_of_traces, require, require_value
-from ..model.oscillator import Oscillator, check_oscillator
+from ..model.oscillator import Oscillator, check_oscillator, has_clock
 from ..model.own_units import in_own_units, own_length, quantity, rescaled
 from ..motion.simulate import simulate
 from ..numerics.compiling import jit
@@ -123,18 +124,44 @@ def _linearized(selection: Selection, osc: Oscillator, record: Record, u, starts
     return ys, jnp.einsum("csij,csik->cjk", columns, columns)
 
 
-def _damped_step(blocks: np.ndarray, damping: float) -> tuple[np.ndarray, np.ndarray]:
-    """Levenberg-Marquardt step of the parameters, [p], and of the starts, [windows, 2]."""
+def _squares(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Squared sensitivities of the data to the parameters, [p], and to the starts, [windows, 2]."""
+    p = blocks.shape[-1] - 3
+    both = np.sum(blocks[:, :p, :p], axis=0), blocks[:, p:-1, p:-1]
+    return np.diag(both[0]), np.einsum("wii->wi", both[1])
+
+
+def _damped_step(
+    blocks: np.ndarray, damping: float, squares: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Levenberg-Marquardt step of the parameters, [p], and of the starts, [windows, 2].
+
+    squares: `_squares` by which they are damped.
+    """
     p = blocks.shape[-1] - 3
     a, g = np.sum(blocks[:, :p, :p], axis=0), np.sum(blocks[:, :p, -1], axis=0)
     c, d, h = blocks[:, :p, p:-1], blocks[:, p:-1, p:-1], blocks[:, p:-1, -1:]
-    a = a + np.diag(damping * np.diag(a) + 1e-12)
-    d = d + (damping * np.einsum("wii->wi", d) + 1e-9)[..., None] * np.eye(2)
+    a = a + np.diag(damping * squares[0] + 1e-12)
+    d = d + (damping * squares[1] + 1e-9)[..., None] * np.eye(2)
     eliminate = c @ np.linalg.inv(d)
     matrix = a - np.sum(eliminate @ c.transpose(0, 2, 1), axis=0)
     du = np.linalg.solve(matrix, np.sum(eliminate @ h, axis=0)[:, 0] - g)
     dstarts = -np.linalg.solve(d, h + (c.transpose(0, 2, 1) @ du)[..., None])[..., 0]
     return du, dstarts
+
+
+@dataclass
+class _Problem:
+    """`_linearized` of a record, and how often it was asked."""
+
+    selection: Selection
+    oscillator: Oscillator
+    record: Record
+    evaluations: int = 0
+
+    def linearized(self, u, starts, fresh):
+        self.evaluations += 1
+        return _linearized(self.selection, self.oscillator, self.record, u, starts, fresh)
 
 
 class _Point(eqx.Module):
@@ -147,7 +174,9 @@ class _Point(eqx.Module):
     chi2: float
 
 
-def _fit_windows(linearized, u, starts, fresh: np.ndarray, relative: float, far: float) -> _Point:
+def _fit_windows(
+    problem: _Problem, u, starts, fresh: np.ndarray, relative: float, far: float
+) -> _Point:
     """Levenberg-Marquardt iteration for one division of the record into windows.
 
     It ends when chi^2 falls by less than the fraction `relative`; for the whole record, when
@@ -156,7 +185,7 @@ def _fit_windows(linearized, u, starts, fresh: np.ndarray, relative: float, far:
     window = np.cumsum(fresh) - 1
 
     def at(u, starts):
-        ys, pieces = linearized(jnp.asarray(u), jnp.asarray(starts), jnp.asarray(fresh))
+        ys, pieces = problem.linearized(jnp.asarray(u), jnp.asarray(starts), jnp.asarray(fresh))
         blocks = np.zeros((window[-1] + 1, *pieces.shape[1:]))
         np.add.at(blocks, window, np.asarray(pieces))
         chi2 = float(np.sum(blocks[:, -1, -1]))
@@ -164,6 +193,7 @@ def _fit_windows(linearized, u, starts, fresh: np.ndarray, relative: float, far:
 
     point = at(u, starts)
     damping, is_last = 1e-2, np.sum(fresh) == 1
+    keeps, squares = has_clock(problem.oscillator), _squares(point.blocks)
     for number in range(LONGER * ITERATIONS if is_last else ITERATIONS):
         if not np.isfinite(point.chi2) or damping > 1e5:
             break
@@ -171,7 +201,13 @@ def _fit_windows(linearized, u, starts, fresh: np.ndarray, relative: float, far:
             break
         if is_last and _gain_left(point.blocks[0]) < GAIN_ENOUGH:
             break
-        du, dstarts = _damped_step(point.blocks, damping)
+        # The x2 of a start at which the mass sticks loses its effect on the way there: so with a
+        # clock the largest squares of the iteration damp its steps (More, 1978).
+        now = _squares(point.blocks)
+        if keeps:
+            now = np.maximum(squares[0], now[0]), np.maximum(squares[1], now[1])
+        squares = now
+        du, dstarts = _damped_step(point.blocks, damping, squares)
         shorter = min(1.0, LONGEST_CHANGE / max(np.max(np.abs(du)), 1e-300))
         moved = point.starts.copy()
         moved[fresh] += np.clip(shorter * dstarts, -0.5, 0.5)
@@ -417,12 +453,7 @@ def fit(
     length = float(own_length(oscillator))
     values, sigmas = values / length, [one if one is None else one / length for one in sigmas]
     record = record_of(times, values, sigmas, length, oscillator)
-    evaluations = 0
-
-    def linearized(u, starts, fresh):
-        nonlocal evaluations
-        evaluations += 1
-        return _linearized(selection, oscillator, record, u, starts, fresh)
+    problem = _Problem(selection, oscillator, record)
 
     data = int(np.sum(np.isfinite(values)))
     freedom = data - u.size - 2
@@ -440,15 +471,13 @@ def fit(
 
     guesses = first_guesses(selection, u, oscillator, record, starts)
     followed: list[_Point] = []
-    for point in _motions_from(linearized, guesses, data, note):
+    for point in _motions_from(problem, guesses, data, note):
         followed.append(point)
         if judged(point).is_noise:
             break
     best = min(followed, key=_misfit_of)
-    verdict = judged(best), estimated
-    found = _result(
-        oscillator, selection, record, times, values, best, *verdict, len(followed), evaluations
-    )
+    verdict, count = (judged(best), estimated), (len(followed), problem.evaluations)
+    found = _result(oscillator, selection, record, times, values, best, *verdict, *count)
     result = rescaled(found, length)
     note(repr(result).splitlines()[0])
     return result
@@ -486,7 +515,7 @@ def _checked_record(ts, x1, x2, noise):
     return times, np.stack(columns, axis=1), sigmas
 
 
-def _motions_from(linearized, guesses, data: int, note) -> Iterator[_Point]:
+def _motions_from(problem, guesses, data: int, note) -> Iterator[_Point]:
     """Motions that the guesses lead to.
 
     First come those whose windows come near the record, then the others, last the motion from the
@@ -496,17 +525,17 @@ def _motions_from(linearized, guesses, data: int, note) -> Iterator[_Point]:
     for number, (u, starts, misfit) in enumerate(itertools.chain([guess], guesses), 1):
         came = "the guess" if np.isnan(misfit) else f"misfit {misfit:.3g} of the smooth formulation"
         note(f"candidate {number}: {came}")
-        point = _in_windows(linearized, u, starts, data, note)
+        point = _in_windows(problem, u, starts, data, note)
         if point.chi2 < FAR_OFF * data:
-            yield _as_one_motion(linearized, point, data, note)
+            yield _as_one_motion(problem, point, data, note)
         else:
             far.append((number, point))
     for number, point in sorted(far, key=lambda one: _misfit_of(one[1])):
         note(f"candidate {number}, from afar")
-        yield _as_one_motion(linearized, point, data, note)
+        yield _as_one_motion(problem, point, data, note)
     note("the guess, in one piece")
     u, starts, _ = guess
-    yield _fit_windows(linearized, u, starts, np.arange(len(starts)) == 0, 0.0, np.inf)
+    yield _fit_windows(problem, u, starts, np.arange(len(starts)) == 0, 0.0, np.inf)
 
 
 def _misfit_of(point: _Point) -> float:
@@ -514,24 +543,24 @@ def _misfit_of(point: _Point) -> float:
     return float(np.nan_to_num(point.chi2, nan=np.inf))
 
 
-def _in_windows(linearized, u, starts, data: int, note) -> _Point:
+def _in_windows(problem, u, starts, data: int, note) -> _Point:
     """Fits all windows as separate motions."""
     fresh = np.full(len(starts), True)
-    point = _fit_windows(linearized, u, starts, fresh, 3e-3, FAR_OFF * data)
+    point = _fit_windows(problem, u, starts, fresh, 3e-3, FAR_OFF * data)
     if not point.chi2 < FAR_OFF * data:
         # The iteration may have stopped while it crept along a valley.
-        point = _fit_windows(linearized, point.u, point.starts, fresh, 0.0, FAR_OFF * data)
+        point = _fit_windows(problem, point.u, point.starts, fresh, 0.0, FAR_OFF * data)
     note(f"  {len(starts)} windows: chi^2 per datum {point.chi2 / data:.3f}")
     return point
 
 
-def _as_one_motion(linearized, point: _Point, data: int, note) -> _Point:
+def _as_one_motion(problem, point: _Point, data: int, note) -> _Point:
     """Joins windows until one is left."""
     pieces, every = len(point.starts), 1
     while True:
         every = min(JOIN * every, pieces)
         fresh, relative = np.arange(pieces) % every == 0, 0.0 if every == pieces else 3e-3
-        point = _fit_windows(linearized, point.u, point.starts, fresh, relative, FAR_OFF * data)
+        point = _fit_windows(problem, point.u, point.starts, fresh, relative, FAR_OFF * data)
         note(f"  {np.sum(fresh)} windows: chi^2 per datum {point.chi2 / data:.3f}")
         if every == pieces:
             return point
