@@ -167,14 +167,14 @@ def test_velocities_of_a_belt_that_swings():
     truth = np.array([0.3, 0.2, 0.7, 0.5, 0.2])
     ts = np.arange(500) * 0.1
 
-    def of(module, values, *law):
+    def parts(module, values, law):
         *wave, force = values
-        belt = module.Belt(module.Oscillating(*wave), *law)
-        forces = (module.Harmonic(force, 1.4),)
-        return module.Oscillator(0.1, (belt,), forces)
+        belt = module.Belt(module.Oscillating(*wave), law)
+        return (belt,), (module.Harmonic(force, 1.4),)
 
     start = (-0.3, 0.3 + 0.2 * np.cos(0.5))
-    states = recorded_of(of(forced, truth, ("coulomb", 1.0, 0.6)), start, ts)
+    osc = forced.Oscillator(0.1, *parts(forced, truth, ("coulomb", 1.0, 0.6)))
+    states = recorded_of(osc, start, ts)
     x2 = states[:, 1] + noise_of(4, 500)
 
     def numbers(osc):
@@ -182,8 +182,8 @@ def test_velocities_of_a_belt_that_swings():
         numbers = wave.mean, wave.amplitude, wave.frequency, wave.phase
         return *numbers, osc.forcing[0].amplitude
 
-    guess = of(jb, truth * [1.1, 0.9, 1.005, 1.2, 1.2], jb.Coulomb(1.0, 0.6))
-    found = jb.fit(guess, ts, x2=x2, where=numbers)
+    belts, forcing = parts(jb, truth * [1.1, 0.9, 1.005, 1.2, 1.2], jb.Coulomb(1.0, 0.6))
+    found = jb.fit(jb.Oscillator(0.1, belts, forcing=forcing), ts, x2=x2, where=numbers)
     assert_recovered(found, truth)
     assert found.noise[1] == pytest.approx(SIGMA, rel=0.25)
 
