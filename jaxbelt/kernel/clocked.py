@@ -43,6 +43,7 @@ from ..model.modes import (
     has_edges,
     mode_acceleration,
     select,
+    share_of_tolerance,
     without_rounding,
 )
 from ..model.oscillator import Oscillator, at_time, fastest, has_possible_numbers
@@ -228,6 +229,7 @@ def _timed_attempt(
     scale1 = atol + rtol * jnp.maximum(jnp.abs(x1), jnp.abs(y1))
     scale2 = atol + rtol * jnp.maximum(jnp.abs(x2), jnp.abs(y2))
     error1, error2 = jnp.abs(h * h * combine(own.ea, stages)), jnp.abs(h * combine(own.e, stages))
+    scale2 = scale2 * _least_share(osc, lanes, clock, y2 - x2, stages[-1], rtol)
     error = jnp.maximum(error1 * scale2, error2 * scale1) / (scale1 * scale2)
     error = jnp.where(stuck, jnp.where(jnp.isfinite(stages[-1]), 0.0, jnp.inf), error)
     integrals = jax.tree.map(lambda i, *s: i + h * combine(own.a[-1], s), lanes.integrals, *slopes)
@@ -235,6 +237,18 @@ def _timed_attempt(
     rate = jnp.where(stuck, _rate_of_stick(end, mode), stages[-1])
     needed = [stages[i] for i in (0, *TIMED_STAGES)]
     return _TimedAttempt(h, y1, y2, stages[-1], rate, lax.stop_gradient(error), integrals, needed)
+
+
+def _least_share(osc: Oscillator, lanes: Lanes, clock: StepClock, rise, a_end, rtol) -> Array:
+    """The least `share_of_tolerance` of the motions relative to the belts."""
+    shares = [share_of_tolerance(rise, lanes.a, a_end, rtol)]
+    for wave in clock.velocities:
+        if isinstance(wave, StepWave):
+            rates = [wave.rate(c) / osc.omega for c in (0.0, 1.0)]
+            course = (wave.at(1.0) - wave.at(0.0)) / osc.omega
+            a = lanes.a - rates[0], a_end - rates[1]
+            shares.append(share_of_tolerance(rise - course, *a, rtol))
+    return functools.reduce(jnp.minimum, shares)
 
 
 def timed_flown(
