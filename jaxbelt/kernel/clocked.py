@@ -92,7 +92,7 @@ STRAIGHT_GUARD = 1.0
 TIMED_STAGES = (2, 6, 4, 7, 8, 9, 10, 13)
 
 
-def _of_lanes(function: Callable, osc: Oscillator, *args: Any) -> Any:
+def of_lanes(function: Callable, osc: Oscillator, *args: Any) -> Any:
     """What a function of an oscillator and more gives, lane by lane."""
     axes = jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, osc)
     return jax.vmap(function, in_axes=(axes, *(0 for _ in args)))(osc, *args)
@@ -114,7 +114,7 @@ def timed_lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, t0: Any) ->
         mode = Mode(tuple(code + jnp.zeros(()) for code in mode.codes))
         return mode, focus & jnp.asarray(True), is_held_for_ever(osc, mode, y)
 
-    mode, rests, forever = _of_lanes(start, osc, x1, x2, t)
+    mode, rests, forever = of_lanes(start, osc, x1, x2, t)
     finite = jnp.isfinite(x1) & jnp.isfinite(x2) & has_possible_numbers(osc)
     status = jnp.where(forever, Status.STUCK_FOREVER.value, Status.OK.value)
     status = jnp.where(rests, Status.PSEUDO_FOCUS.value, status)
@@ -521,7 +521,7 @@ def pass_timed_events(
     no = jnp.zeros_like(fired)
     state = lanes.x1, lanes.x2, lanes.a, lanes.mode, no, no
     args = lanes.mode, lanes.hit, lanes.x1, lanes.x2, lanes.t
-    passed = where_any(fired, lambda: _of_lanes(through_guard, osc, *args), state)
+    passed = where_any(fired, lambda: of_lanes(through_guard, osc, *args), state)
     x1, x2, a, mode, captured, forever = select(fired, passed, state)
     captured = captured & captures
     # Slip onset is tangent: x2' = 0 there up to rounding, for a law without a jump.
