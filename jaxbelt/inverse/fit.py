@@ -417,11 +417,15 @@ def fit(
 
     All numbers are dimensionless, as in `simulate`. The state at the first time is estimated, too.
 
+    Of a forced oscillator amplitudes, frequencies and phases are parameters like others. What a
+    record does not tell is when it was begun: fit a phase. A frequency should be known so well that
+    the forcing is not shifted by more than a radian or two in the time of the record.
+
     Args:
         oscillator: The guess. One that is 30 per cent off is mostly near enough for a stick-slip
             record of many loops. The status MISFIT may mean that it was not: give a nearer one, or
             more starts.
-        ts: Times tau, increasing, [samples].
+        ts: Times tau, increasing, [samples]; those of the cosines where there is forcing.
         x1: Displacements, [samples], NaN where a datum is missing; or None.
         x2: Velocities, likewise. One of x1 and x2 has to be given.
         where: Selects the parameters, as in `equinox.tree_at`: one number of the oscillator, or a
