@@ -321,9 +321,9 @@ def _quartic(start, end, change, h) -> list[Array]:
 
 
 def _meetings(
-    osc, clock: StepClock, window: TimedWindow, lanes: Lanes, new: _TimedAttempt, rtol, atol
+    osc, clock: StepClock, window: TimedWindow, lanes: Lanes, new: _TimedAttempt, rtol, atol, lands
 ):
-    """What the step has to do with each guard of its mode."""
+    """What the step has to do with each guard of its mode; lands: see `_limit_of_stick`."""
     h, n, ones = clock.h, len(osc.belts), clock.ones
     reach = LANDING * jnp.sqrt(rtol)
     room = LANDS_WITHIN * (atol + rtol * jnp.abs(new.x2)) * h
@@ -374,7 +374,7 @@ def _meetings(
     no = none > 0
     limit = where_any(
         stuck,
-        lambda: _limit_of_stick(osc, clock, window, lanes, new, room, reach),
+        lambda: _limit_of_stick(osc, clock, window, lanes, new, room, reach, lands),
         _GuardMeeting(no, no, none + 1, none + NEVER, jnp.full_like(lanes.hit, 3 * n)),
     )
     asked = stuck & (lanes.status != Status.STUCK_FOREVER.value)
@@ -384,11 +384,12 @@ def _meetings(
 
 
 def _limit_of_stick(
-    osc, clock: StepClock, window, lanes, new: _TimedAttempt, room, reach
+    osc, clock: StepClock, window, lanes, new: _TimedAttempt, room, reach, lands: bool
 ) -> _GuardMeeting:
     """The meeting with a limit of what stuck belts can hold, capacity -+ needed: the nearer one.
 
-    Where it may meet both the step is cut.
+    Where it may meet both the step is cut. lands: whether a step always ends near to the root; else
+    one that holds it may be gone back to it, however far that is.
     """
     own, n, h = nystroem(), len(osc.belts), clock.h
     nodes = tuple(round(float(own.c[i]), 12) for i in (0, *TIMED_STAGES))
@@ -421,7 +422,7 @@ def _limit_of_stick(
     one = _meeting(points, doubt, fuzz, ends, h, room, reach, number)
     both = (jnp.maximum(*least) <= doubt) & (h > SHORTEST_TIMED_STEP * reach)
     one = replace(one, cut=one.cut | both, there=jnp.where(both, 0.5 * one.there, one.there))
-    if any(isinstance(v, StepWave) for v in clock.velocities):
+    if lands or any(isinstance(v, StepWave) for v in clock.velocities):
         return one
     # The way is straight: the state at the root is as good as that at the end.
     _, slope, _ = value_at(points, one.there)
@@ -449,7 +450,8 @@ def take_timed_step(
     h = jnp.where(going, jnp.minimum(jnp.minimum(lanes.h, window.longest), remaining), 0.0)
     clock = StepClock.of(osc, ones, lanes.t, h)
     new = _timed_attempt(osc, clock, window, lanes, rtol, atol, rates)
-    found = _meetings(osc, clock, window, lanes, new, rtol, atol)
+    # Integrals are known at the ends of steps, and near to them.
+    found = _meetings(osc, clock, window, lanes, new, rtol, atol, rates is not None)
     delta = functools.reduce(jnp.minimum, [one.delta for one in found])
     number = first_of(
         [one.delta == delta for one in found], [one.number for one in found], jnp.asarray(-1)

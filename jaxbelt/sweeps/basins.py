@@ -45,7 +45,8 @@ from .attractor import KINDS, Attractor
 from .datasets import decoded, flags
 from .forced_basins import forced_labels
 from .naming import Found, is_cycle, words_for
-from .question import LONG_ENOUGH, settings_of_runs
+from .question import LONG_ENOUGH, as_start, settings_of_runs
+from .strobes import FORCED_KINDS, ForcedAttractor
 from .sweep import sweep
 from .work import results_of
 
@@ -253,7 +254,8 @@ class BasinStability(eqx.Module):
     fraction below 3/n, with a confidence of 95 per cent.
 
     Attributes:
-        fractions: Dictionary with the keys "equilibrium", "cycle", "stuck" and "undecided".
+        fractions: Dictionary with the keys "equilibrium", "cycle", "stuck" and "undecided"; of a
+            forced oscillator "periodic", "quasiperiodic", "chaotic" in place of "cycle".
         standard_errors: Standard errors, with the same keys.
         n: Number of starts.
     """
@@ -483,6 +485,7 @@ def basin_stability(
     n: int = 10_000,
     key: Array,
     t1: float = LONG_ENOUGH,
+    t0: float = 0.0,
     rtol: float = 1e-8,
     atol: float | None = None,
 ) -> BasinStability:
@@ -496,6 +499,7 @@ def basin_stability(
         n: Number of starts, drawn uniformly.
         key: Random key, from `jax.random.key`.
         t1: Time at which a run that has reached no attractor is given up.
+        t0: Time of the starts, for a forced oscillator.
         rtol: Relative tolerance of a step, as in `sweep`.
         atol: Absolute tolerance of a step, as in `sweep`.
 
@@ -506,12 +510,14 @@ def basin_stability(
         ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(oscillator, "oscillator")
-    refuse_clock(oscillator, "basin_stability", "jb.sweep with axes x1 and x2")
     corners, n = as_box(box), as_whole(n, "n")
     check_key(key)
     numbers = settings_of_runs(t1, rtol, atol)
+    names: tuple[str, ...] = KINDS
+    if has_clock(oscillator):
+        names, numbers["t0"] = FORCED_KINDS, as_start(t0, numbers["t1"])
     kinds = _kinds(oscillator, starts_in(corners, n, key), **numbers)
-    fractions = {name: float(np.mean(kinds == i)) for i, name in enumerate(KINDS)}
+    fractions = {name: float(np.mean(kinds == i)) for i, name in enumerate(names)}
     errors = {name: float(standard_error(f, n)) for name, f in fractions.items()}
     return BasinStability(fractions, errors, n)
 
@@ -541,14 +547,15 @@ def check_key(key: Any) -> None:
     require_value(typed or raw, "key", "one key, such as jax.random.key(0)", key)
 
 
-def _kinds(osc: Oscillator, starts: np.ndarray, t1, rtol, atol) -> np.ndarray:
-    """Numbers of `attractor.KINDS` for starts [2, n], in the order of the starts."""
+def _kinds(osc: Oscillator, starts: np.ndarray, **numbers: Any) -> np.ndarray:
+    """Numbers of the kinds of attractors for starts [2, n], in the order of the starts."""
     leaves, structure = jax.tree.flatten(in_units_of_run(osc))
     edges = bool(np.any([np.isfinite([belt.lower, belt.upper]) for belt in osc.belts]))
-    program = Program(structure, (False,) * len(leaves), Attractor(), edges)
+    observer = ForcedAttractor() if has_clock(osc) else Attractor()
+    program = Program(structure, (False,) * len(leaves), observer, edges)
 
     def rows_of(first: int, last: int) -> np.ndarray:
         return starts[None, :, first:last]
 
     n = starts.shape[1]
-    return results_of(program, leaves, rows_of, n, t1=t1, rtol=rtol, atol=atol)["kind"].astype(int)
+    return results_of(program, leaves, rows_of, n, **numbers)["kind"].astype(int)

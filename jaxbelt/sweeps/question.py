@@ -222,8 +222,6 @@ def _observer(observe: Any, clock: bool) -> Observer:
     expected = f"{names} or an object with init, update, finish"
     require_value(fits, "observe", expected, observe)
     if hasattr(observe, "at") or hasattr(observe, "rates"):
-        told = "without `rates` where the oscillators are forced"
-        require(not (clock and hasattr(observe, "rates")), "observe", told, type(observe).__name__)
         checked(getattr(observe, "at", (AtEvents(),)))
         return Along(observe)
     return Reduce(observe)
