@@ -151,7 +151,7 @@ def _damped_step(
 
 
 @dataclass
-class _Problem:
+class _Linearization:
     """`_linearized` of a record, and how often it was asked."""
 
     selection: Selection
@@ -175,7 +175,7 @@ class _Point(eqx.Module):
 
 
 def _fit_windows(
-    problem: _Problem, u, starts, fresh: np.ndarray, relative: float, far: float
+    problem: _Linearization, u, starts, fresh: np.ndarray, relative: float, far: float
 ) -> _Point:
     """Levenberg-Marquardt iteration for one division of the record into windows.
 
@@ -457,7 +457,7 @@ def fit(
     length = float(own_length(oscillator))
     values, sigmas = values / length, [one if one is None else one / length for one in sigmas]
     record = record_of(times, values, sigmas, length, oscillator)
-    problem = _Problem(selection, oscillator, record)
+    problem = _Linearization(selection, oscillator, record)
 
     data = int(np.sum(np.isfinite(values)))
     freedom = data - u.size - 2

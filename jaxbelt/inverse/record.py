@@ -15,7 +15,7 @@ from ..model.oscillator import Oscillator, frequencies, has_clock
 
 #: Length of the first windows, less than half a loop: no phase is lost over it. Data count as near
 #: to each other within a third of a time unit. With faster forcing both are shorter.
-WINDOW, NEAR = 2.5, 0.35
+WINDOW, SMOOTHED = 2.5, 0.35
 #: Noise alone makes a fit as bad as this once in a million records.
 IMPLAUSIBLE = 1e-6
 #: Residuals with a larger autocorrelation, in units of 1/sqrt(data), are not noise.
@@ -72,7 +72,7 @@ def record_of(
     size = int(np.clip(round(WINDOW / quick / step), 1, n))
     pieces = -(-n // size)
     begin = np.arange(pieces) * size
-    smoothed = [local_cubics(ts, column, NEAR / quick) for column in values.T]
+    smoothed = [local_cubics(ts, column, SMOOTHED / quick) for column in values.T]
     known = np.isfinite(values)
     given = [i for i in (0, 1) if np.any(known[:, i])]
     if 0 in given:
@@ -111,7 +111,7 @@ def quickest(osc: Oscillator) -> float:
 
 
 def local_cubics(
-    ts: np.ndarray, column: np.ndarray, near: float = NEAR
+    ts: np.ndarray, column: np.ndarray, near: float = SMOOTHED
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Local cubic through the data near every time: its value and slope there, and the noise.
 
