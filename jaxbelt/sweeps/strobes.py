@@ -52,7 +52,7 @@ CONFIRMED = 16
 APART, APART_OF_ERRORS = 10.0, 1000.0
 #: Strobes after which a state is no longer waited for at first; then twice as many, and so on.
 PATIENCE = 8
-#: Share of a run before its exponent is measured, and blocks whose means tell the standard error.
+#: Share of a run before its exponent is measured; blocks whose means tell the standard error.
 TRANSIENT, BLOCKS = 0.25, 25
 #: Standard errors within which an exponent is zero; per period the error of its computation, and how
 #: large both may be together where a motion is quasiperiodic.
