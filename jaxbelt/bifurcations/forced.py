@@ -379,6 +379,8 @@ def forced_point(
     found from some states.
     """
     timed = condition.with_clock()
+    # Where it is looked for makes no difference to a point.
+    value = lax.stop_gradient(value)
     near = lax.stop_gradient(variation.oscillator(value))
     require(
         is_concrete((near, value)),

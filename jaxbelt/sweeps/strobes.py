@@ -52,11 +52,11 @@ CONFIRMED = 16
 APART, APART_OF_ERRORS = 10.0, 1000.0
 #: Strobes after which a state is no longer waited for at first; then twice as many, and so on.
 PATIENCE = 8
-#: Share of a run before its exponent is measured, and blocks whose means tell the standard error.
+#: Share of a run before its exponent is measured; blocks whose means tell the standard error.
 TRANSIENT, BLOCKS = 0.25, 25
-#: Standard errors within which an exponent is zero; of a quasiperiodic motion they may be so large,
-#: per period.
-DEVIATIONS, RESOLVED = 3.0, 0.01
+#: Standard errors within which an exponent is zero; per period the error of its computation, and how
+#: large both may be together where a motion is quasiperiodic.
+DEVIATIONS, COMPUTED, RESOLVED = 3.0, 1e-4, 0.01
 #: An extremum is known from a point that is this near in time; steps are cut until there is one.
 NEAR, LEAST_CUT = 1e-3, 1e-3
 
@@ -386,13 +386,14 @@ class ForcedAttractor(Strobed):
         exponent, error = self.exponent(lanes)
         open_ = (seen.kind == UNDECIDED) & (lanes.status == Status.OK.value)
         resolved = open_ & jnp.isfinite(exponent)
-        chaotic = resolved & (exponent > DEVIATIONS * error)
-        small = DEVIATIONS * error * _period(osc, seen.turns) < RESOLVED
-        even = resolved & (jnp.abs(exponent) <= DEVIATIONS * error) & small & ~growth.sticks
+        once = _period(osc, seen.turns)
+        doubt = jnp.maximum(DEVIATIONS * error, COMPUTED / once)
+        chaotic = resolved & (exponent > doubt)
+        even = resolved & (jnp.abs(exponent) <= doubt) & (doubt * once < RESOLVED) & ~growth.sticks
         even = even & (seen.repeats.n == 0)
         kind = jnp.where(chaotic, CHAOTIC, jnp.where(even, QUASIPERIODIC, seen.kind))
         lost = open_ & (kind == UNDECIDED)
-        period = seen.repeats.n * _period(osc, seen.turns)
+        period = seen.periods.astype(lanes.t.dtype) * once
         repeats, holds = kind == PERIODIC, kind == STUCK_FOR_EVER
         rests = holds | (kind == EQUILIBRIUM)
 
@@ -444,7 +445,8 @@ class LargestExponent(Strobed):
 
 def _period(osc: OwnOscillator, turns: Array) -> Array:
     """Time between two strobes; a turn where there is no period."""
-    return 2 * np.pi * jnp.maximum(turns, 1) / jnp.abs(frequencies(osc)[0])
+    first = jnp.abs(frequencies(osc)[0])
+    return 2 * np.pi * jnp.maximum(turns, 1).astype(first.dtype) / first
 
 
 def _way_to_zero(value: Array, slope: Array, h: Array) -> Array:
@@ -535,7 +537,7 @@ def _saltation(osc: OwnOscillator, before: Mode, after: Mode, number: Array, y, 
 
     def guard(*y):
         guards = guards_at(osc, before, y)
-        return jnp.sum(jnp.where(jnp.arange(guards.size) == number, guards, 0.0))
+        return jnp.sum(jnp.where(jnp.arange(guards.size) == number.astype(int), guards, 0.0))
 
     _, moved = jax.jvp(guard, y, (*d, jnp.zeros_like(d[0])))
     _, slope = jax.jvp(guard, y, entry)
