@@ -49,9 +49,10 @@ def recorded(values, start=START, ts=TS):
 
 
 def recorded_of(osc, start, ts):
-    y, states = np.array(start), [np.array(start)]
+    y = np.array(start)
+    states = [y]
     for before, after in itertools.pairwise(ts):
-        y = forced.simulate(osc, y, after, t0=before).y_end
+        y = np.asarray(forced.simulate(osc, y, after, t0=before).y_end)
         states.append(y)
     return np.array(states)
 
