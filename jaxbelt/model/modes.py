@@ -133,7 +133,7 @@ def fastest_rate(a_by_x2: Array) -> Array:
 #: may delay the motion; see `share_of_tolerance`.
 LAYER, DELAY = 0.01, 10.0
 #: Rounding of x2 in a step, over x2.
-ROUNDING = 5e-15
+X2_ROUNDING = 5e-15
 
 
 def share_of_tolerance(rise: Array, a_start: Array, a_end: Array, rtol: ArrayLike) -> Array:
@@ -152,7 +152,7 @@ def share_of_tolerance(rise: Array, a_start: Array, a_end: Array, rtol: ArrayLik
     change = jnp.abs(a_end - a_start)
     grows = (jnp.abs(rise) < LAYER * change) & (jnp.abs(a_end) > jnp.abs(a_start))
     grows = grows & (a_start * a_end >= 0)
-    share = jnp.maximum(DELAY * change, ROUNDING / rtol)
+    share = jnp.maximum(DELAY * change, X2_ROUNDING / rtol)
     return jnp.where(grows, jnp.minimum(1.0, share), 1.0)
 
 

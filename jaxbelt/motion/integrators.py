@@ -202,7 +202,7 @@ class Adaptive(AbstractIntegrator):
         return *last, solution.event_mask
 
 
-def _at(osc: Oscillator, y: State) -> Oscillator:
+def _oscillator_at(osc: Oscillator, y: State) -> Oscillator:
     """The oscillator without a clock that it is at a state."""
     return at_time(osc, y[2]) if has_clock(osc) else osc
 
@@ -220,7 +220,7 @@ class _Layers(eqx.Module):
     @classmethod
     def of(cls, osc: Oscillator, mode: Mode, field: Field, y: State) -> "_Layers":
         none = jnp.zeros(())
-        bends = [_bends(belt, none) for belt in _at(osc, y).belts]
+        bends = [_bends(belt, none) for belt in _oscillator_at(osc, y).belts]
         bends = [
             jnp.where(jnp.abs(code) == 1, osc.omega * bend, 0.0)
             for code, bend in zip(mode.codes, bends, strict=True)
@@ -232,7 +232,11 @@ class _Layers(eqx.Module):
         """The share of its tolerance that x2 may be off by, see `share_of_tolerance`, and how many
         steps this one has to be for none to jump a layer: each goes half of the way to it."""
 
-        a, now, later = self.field(start)[1], _at(self.osc, start), _at(self.osc, end)
+        a, now, later = (
+            self.field(start)[1],
+            _oscillator_at(self.osc, start),
+            _oscillator_at(self.osc, end),
+        )
         shares, counts = [], []
         for belt, moved, thickness in zip(now.belts, later.belts, self.thickness, strict=True):
             gap, gap_end = (
@@ -279,7 +283,7 @@ def density(osc: Oscillator, mode: Mode, x1: Array, x2: Array, *t: Array) -> Arr
     is small.
     """
     waves = [fastest(osc)] if has_clock(osc) else []
-    osc = _at(osc, (x1, x2, *t))
+    osc = _oscillator_at(osc, (x1, x2, *t))
     a, a_by_x2 = jax.jvp(
         lambda x2: mode_acceleration(osc, mode, x1, x2), (x2,), (jnp.ones_like(x2),)
     )
