@@ -23,10 +23,12 @@ from .bifurcations.diagrams import BifurcationDiagram
 from .checks import in_words, outside_of_traces, require
 from .cycles.cycle import Cycle
 from .cycles.functionals import energy_dissipated
+from .cycles.periodic import PeriodicMotion
 from .cycles.portrait import Portrait
 from .cycles.shocks import FatalShock
 from .inverse.fit import Fit
 from .model.equilibria import Equilibria
+from .model.forcing import BaseMotion, ConstantForce, Harmonic
 from .model.friction import LawInUnits
 from .model.machine import Machine, Units
 from .model.modes import STUCK, mode_acceleration, mode_of, stick_rate
@@ -59,6 +61,13 @@ UNITS_OF_FIELDS: dict[str, tuple[str, Callable[[Units], Any]]] = {
     "velocity": ("m s-1", lambda units: units.velocity),
     "load": ("N", lambda units: units.force),
     **dict.fromkeys(("lower", "upper"), ("m", lambda units: units.length)),
+    "frequency": ("rad s-1", lambda units: 1 / units.time),
+    "phase": ("rad", lambda units: jnp.ones(())),
+}
+#: Likewise of the amplitude of a force; numbers of a user's force have units that its author knows.
+UNITS_OF_FORCES = {
+    **dict.fromkeys((Harmonic, ConstantForce), ("N", lambda units: units.force)),
+    BaseMotion: ("m", lambda units: units.length),
 }
 #: Relative accuracy to which a number of a friction law has to follow a power of the unit of speed.
 POWER_ROUNDING = 1e-12
@@ -89,6 +98,7 @@ def in_si(
     result: Union[
         Trajectory,
         Cycle,
+        PeriodicMotion,
         Portrait,
         FatalShock,
         Basins,
@@ -111,6 +121,7 @@ def in_si(
       `event_kind` and `event_belt`.
     - a cycle: `period`, `stick_duration` of each belt, `x1_min`, `x1_max`, `x2_min`, `x2_max`,
       `amplitude`, and `energy`, which friction and dashpot turn into heat in one period.
+    - a forced motion: the same without `energy`, `x1` and `x2` at the phase 0, and `periods`.
     - a portrait: over `row`, the columns of its `table()`, `rate` in 1/s.
     - a shock: `x1` and `x2` of its start, `shock_x1`, `shock_x2`, and `distance`, in m/s where it
       changes the velocity alone. A distance that combines both stays dimensionless.
@@ -122,8 +133,9 @@ def in_si(
       fitted motion, `x1` and `x2`, and `x1_residual` and `x2_residual`, datum minus motion.
     - a diagram, or fractions: over `row`, the columns of its `table()`; a special point is a row
       with the branch -1. `value`, of the parameter, is in m/s for the velocity of a belt, in N for
-      a load (the normal force), in m for a contact edge, in N s/m for the damping; the argument of
-      a function stays as the function takes it.
+      a load (the normal force), in m for a contact edge, in N s/m for the damping, in rad/s for the
+      frequency of a force, in N for its amplitude (in m for that of a support); the argument of a
+      function stays as the function takes it.
     - a dataset: its own variables, with derivatives by starts and parameters where the units are
       the same in all runs. Results of a user's observable stay dimensionless, and so does the
       attribute `start`; the words for `label` of basins say in m where the mass rests.
@@ -136,8 +148,8 @@ def in_si(
 
     Args:
         result: A result for the machine's oscillator: a `Trajectory`, a `Cycle`, a `Portrait`, a
-            `FatalShock`, `Basins`, `BasinStability`, a `Fit`, a `BifurcationDiagram`, an
-            `OrbitDiagram`, `BasinFractions`, or the dataset of a sweep.
+            `PeriodicMotion`, a `FatalShock`, `Basins`, `BasinStability`, a `Fit`, a
+            `BifurcationDiagram`, an `OrbitDiagram`, `BasinFractions`, or the dataset of a sweep.
         machine: The `Machine`. Where a sweep has axes other than starts, or a function was given in
             place of an oscillator: a function of these that returns the machine, as its units may
             differ from run to run. `machine.units` in place of the machine only converts and
@@ -159,7 +171,7 @@ def in_si(
     match result:
         case Trajectory():
             return _trajectory(result, one)
-        case Cycle():
+        case Cycle() | PeriodicMotion():
             return _cycle(result, one)
         case Portrait():
             return _of_portrait(result, one)
@@ -180,8 +192,9 @@ def in_si(
             require(not is_done, "result", "dimensionless", "a dataset that is in SI units")
             return _dataset(result, machine)
     raise TypeError(
-        "result must be a Trajectory, a Cycle, a Portrait, a FatalShock, Basins, BasinStability, "
-        "a Fit, a BifurcationDiagram, an OrbitDiagram, BasinFractions, or the dataset of a sweep, "
+        "result must be a Trajectory, a Cycle, a PeriodicMotion, a Portrait, a FatalShock, Basins, "
+        "BasinStability, a Fit, a BifurcationDiagram, an OrbitDiagram, BasinFractions, or the "
+        "dataset of a sweep, "
         f"got {type(result).__name__}{INSTEAD.get(type(result), '')}"
     )
 
@@ -225,7 +238,7 @@ def check_machine(result: Any, machine: Any) -> None:
         case Fit():
             osc = result.oscillator
             free = {name for tied in result.names for name in tied.split(" = ")}
-        case Cycle() | Basins() | Portrait():
+        case Cycle() | PeriodicMotion() | Basins() | Portrait():
             osc = result.oscillator
         case FatalShock():
             osc = result.portrait.oscillator
@@ -346,27 +359,34 @@ def _check_belts(run: Trajectory, machine: Any) -> None:
             require(False, "result", expected, came)
 
 
-def _cycle(cycle: Cycle, machine: Machine | Units) -> "xarray.Dataset":
+def _cycle(cycle: Cycle | PeriodicMotion, machine: Machine | Units) -> "xarray.Dataset":
     import xarray
 
     units = units_of(machine)
     require(cycle.unknowns.ndim == 2, "result", "one cycle, not a batch", repr(cycle))
     check_machine(cycle, machine)
+    x1_min, x1_max = cycle.x1_min, cycle.x1_max
     variables = {
         "period": ((), cycle.period, "period"),
         "stick_duration": ("belt", cycle.stick_durations, "time stuck to the belt in one loop"),
-        "x1_min": ((), cycle.x1_min, "smallest displacement"),
-        "x1_max": ((), cycle.x1_max, "largest displacement"),
+        "x1_min": ((), x1_min, "smallest displacement"),
+        "x1_max": ((), x1_max, "largest displacement"),
         "x2_min": ((), cycle.x2_min, "smallest velocity"),
         "x2_max": ((), cycle.x2_max, "largest velocity"),
-        "amplitude": ((), (cycle.x1_max - cycle.x1_min) / 2, "half of the span of displacement"),
-        "energy": ((), energy_dissipated(cycle), "energy dissipated in one period"),
+        "amplitude": ((), (x1_max - x1_min) / 2, "half of the span of displacement"),
     }
+    attrs: dict[str, Any] = {"status": Status(int(cycle.status)).name}
+    if isinstance(cycle, PeriodicMotion):
+        attrs["periods"] = cycle.periods
+        for i, word in enumerate(("displacement", "velocity")):
+            variables[f"x{i + 1}"] = ((), cycle.start[i], f"{word} at the phase 0")
+    else:
+        energy = energy_dissipated(cycle)
+        variables["energy"] = ((), energy, "energy dissipated in one period")
     found = {
         name: _variable(dims, values, name, units, long_name)
         for name, (dims, values, long_name) in variables.items()
     }
-    attrs = {"status": Status(int(cycle.status)).name}
     return xarray.Dataset(found, {"belt": np.arange(len(cycle.oscillator.belts))}, attrs)
 
 
@@ -429,10 +449,23 @@ def _unit_of(name: str, osc: Oscillator, units: Units) -> tuple[str, float]:
         if ".friction." in path:
             found.add(_unit_in_law(path, osc, units))
         else:
-            symbol, size = UNITS_OF_FIELDS[path.rpartition(".")[2]]
+            symbol, size = _unit_of_field(path, osc)
             found.add((symbol, float(size(units))))
     require(len(found) == 1, "result", "of tied parameters with one unit", name)
     return found.pop()
+
+
+def _unit_of_field(path: str, osc: Oscillator) -> tuple[str, Callable[[Units], Any]]:
+    """As `UNITS_OF_FIELDS`, for a number that is in no friction law."""
+    owner, _, field = path.rpartition(".")
+    if owner.startswith("forcing["):
+        force = osc.forcing[int(owner.removeprefix("forcing[").partition("]")[0])]
+        known = UNITS_OF_FORCES.get(type(force))
+        if known is None:
+            return "", lambda units: 1.0
+        return known if field == "amplitude" else UNITS_OF_FIELDS[field]
+    # The mean and the amplitude of a wave are what the field is that oscillates.
+    return UNITS_OF_FIELDS[owner.rpartition(".")[2] if field in ("mean", "amplitude") else field]
 
 
 def _unit_in_law(path: str, osc: Oscillator, units: Units) -> tuple[str, float]:
@@ -516,7 +549,7 @@ def units_along(
     name, belts = result.name, len(osc.belts)
     belt = name.removeprefix("belts[").partition("]")[0] if name.startswith("belts[") else "0"
     require(int(belt) < belts, "machine", f"of a belt {belt}, of which result is", f"{belts} belts")
-    known = "the velocity, load, edges or law of a belt, or the damping"
+    known = "the velocity, load, edges or law of a belt, a force, or the damping"
     require(name != "omega", "result", f"along {known}", "one along omega, 1 in every machine")
     return units, _unit_of(name, osc, units)
 

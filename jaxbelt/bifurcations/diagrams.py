@@ -326,7 +326,7 @@ def _forced_diagram(osc: Any, where: Any, span: Any, start: Any) -> BifurcationD
     return BifurcationDiagram(
         points=tuple(given_point(point, variation) for point in points),
         branches=tuple(replace(one, values=one.values * unit) for one in branches),
-        regions=(),
+        regions=((first, last, ""),),
         oscillator=osc if isinstance(osc, Oscillator) else given.oscillator(np.array([first])),
         name=variation.names[0],
         as_paper=False,

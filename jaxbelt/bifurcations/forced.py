@@ -46,6 +46,7 @@ from ..cycles.periodic import (
     Followed,
     PeriodicMotion,
     attracted,
+    extrema_of,
     motion_at,
     motions_of,
     nothing_found,
@@ -361,13 +362,11 @@ def _solved_timed_point(family, system, z0, p0, status):
     return point_of(family, solution, motion, jnp.asarray(jnp.nan), status), (z, solution.p)
 
 
-def place_of_motion(motion: PeriodicMotion, samples: int = 257) -> np.ndarray:
+def place_of_motion(motion: PeriodicMotion) -> np.ndarray:
     """Smallest and largest x1, the same of x2, and the period, [5]."""
     if int(motion.status) != Status.OK:
         return np.full(5, np.nan)
-    states = np.asarray(motion.sample(samples))
-    x1, x2 = states.T
-    return np.array([x1.min(), x1.max(), x2.min(), x2.max(), float(motion.period)])
+    return np.append(np.asarray(extrema_of(motion)), float(motion.period))
 
 
 def forced_point(

@@ -56,6 +56,8 @@ LEAST_STEPS, PLACING = 8 * ARC_STEPS, 2
 RATIOS = 64
 #: A boundary or limit that is passed by less is touched.
 TOUCHES_AGAIN = 1e-8
+#: Newton steps from where a quintic has an extremum to where the motion has it.
+EXTREMUM_STEPS = 2
 
 
 class TimedChain(Chain):
@@ -374,15 +376,23 @@ def guards_along(osc: Oscillator, chain: TimedChain, z: Array) -> tuple[Array, A
 
 
 def least_guard(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array) -> Array:
-    """The least value that a guard of its mode has along an arc, up to rounding.
-
-    Between the ends of steps a guard is the quintic with its values, slopes and curvatures there.
-    """
+    """The least value that a guard of its mode has along an arc, up to rounding."""
     mode = mode_of(codes)
     states = states_along(osc, codes, mesh, y, duration)
-    at = jax.vmap(
-        lambda y: trend_of(osc, mode, lambda y: guards_at(osc, mode, y), (y[0], y[1], y[2]))
-    )(states)
+    least, _ = _least_between(osc, codes, states, lambda y: guards_at(osc, mode, y))
+    return jnp.min(least)
+
+
+def _least_between(
+    osc: Oscillator, codes: Array, states: Array, function: Callable
+) -> tuple[Array, Array]:
+    """The least values of functions of the state between the ends of an arc's steps, and where, as
+    fractions of the steps, [steps, functions] each.
+
+    There a function is the quintic with its values, slopes and curvatures at both ends.
+    """
+    mode = mode_of(codes)
+    at = jax.vmap(lambda y: trend_of(osc, mode, function, (y[0], y[1], y[2])))(states)
     there = jnp.isfinite(at.value)
     h = jnp.diff(states[:, 2])[:, None]
     value, slope, curvature = (jnp.where(there, one, 0.0) for one in at)
@@ -402,13 +412,61 @@ def least_guard(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: 
         first, second = _derivatives(powers, s)
         s = jnp.clip(s - first / jnp.where(second > 0, second, jnp.inf), 0.0, 1.0)
     least = jnp.minimum(jnp.min(values, axis=0), quintic(s))
-    return jnp.min(jnp.where(there[:-1], least, jnp.inf))
+    return jnp.where(there[:-1], least, jnp.inf), s
 
 
 def _derivatives(powers: list[Array], s: Array) -> tuple[Array, Array]:
     first = sum(k * p * s ** (k - 1) for k, p in enumerate(powers) if k)
     second = sum(k * (k - 1) * p * s ** (k - 2) for k, p in enumerate(powers) if k > 1)
     return jnp.asarray(first), jnp.asarray(second)
+
+
+#: What is least where x1, and x2, is smallest or largest.
+_SIDES = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+
+
+def extrema_along(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
+    """The smallest and the largest x1, and those of x2, of a solution of the equations, [4].
+
+    Differentiable by the oscillator and the unknowns, twice.
+    """
+
+    def one(osc, codes, mesh, unknown):
+        states = states_along(osc, codes, mesh, unknown[:3], unknown[3])
+        still = lax.stop_gradient((osc, states))
+        guess = _least_between(still[0], codes, still[1], lambda y: _SIDES @ jnp.stack(y[:2]))
+        return jax.vmap(functools.partial(_least, osc, codes, states))(
+            _SIDES, *(x.T for x in guess)
+        )
+
+    least = jnp.min(arc_by_arc(one)((osc,), (chain.codes, chain.mesh, z)), axis=0)
+    return least * np.sum(_SIDES, axis=1)
+
+
+def _least(osc: Oscillator, codes: Array, states: Array, weight: Array, least: Array, at: Array):
+    """The least value of weight (x1, x2) along an arc, from the quintics' least values and their
+    places between the ends of steps, [steps] each."""
+    mode, step = mode_of(codes), jnp.argmin(least)
+    before, s = states[step], at[step]
+    h = states[step + 1, 2] - before[2]
+
+    def state(s):
+        slipped = arc_step(functools.partial(slip_slopes, osc, codes), before, s * h, FINE)
+        held = jnp.stack(carried(osc, mode, (before[0], before[1], before[2]), s * h))
+        return jnp.where(mode.any_stuck, held, slipped)
+
+    def function(y):
+        return weight @ jnp.stack(y[:2])
+
+    for _ in range(EXTREMUM_STEPS):
+        s = lax.stop_gradient(s)
+        y = state(s)
+        found = trend_of(osc, mode, function, (y[0], y[1], y[2]))
+        bends = (found.curvature > 0) & (h > 0)
+        new = s - found.slope / jnp.where(bends, found.curvature * h, 1.0)
+        # At the end of an arc a coordinate may have a kink, and be extreme for that.
+        s = jnp.where(bends & (s > 0) & (s < 1) & (new > 0) & (new < 1), new, s)
+    return function(state(s))
 
 
 def timed_admissible(osc: Oscillator, chain: TimedChain, z: Array) -> Array:

@@ -1,9 +1,10 @@
 """Functionals: one number of a cycle, to be swept, plotted, fitted or designed.
 
-Each takes a `Cycle` and returns a scalar that is differentiable with respect to the oscillator's
-parameters, forward and reverse, and works on batches under `jax.vmap`. All quantities are
-dimensionless: times in units of 1/omega, energies in units of k L^2 where L is the unit of length.
-Where the status of the cycle is not OK they are NaN.
+Each takes a `Cycle`, and all but `gap` and the energies a `PeriodicMotion`, too. It returns a
+scalar that is differentiable with respect to the oscillator's parameters, forward and reverse, and
+works on batches under `jax.vmap`. All quantities are dimensionless: times in units of 1/omega,
+energies in units of k L^2 where L is the unit of length. Where the status of the cycle is not OK
+they are NaN.
 """
 
 from collections.abc import Callable
@@ -20,28 +21,27 @@ from ..model.oscillator import Oscillator
 from ..numerics.compiling import jit
 from .chains import Chain
 from .cycle import Cycle
+from .periodic import PeriodicMotion
 from .shooting import flow
 
-_COORDINATES = {"x1": 0, "x2": 1}
 
-
-def period(cycle: Cycle) -> Array:
-    """Duration of one loop.
+def period(cycle: Cycle | PeriodicMotion) -> Array:
+    """Duration of one loop, of a forced motion of all the periods after which it repeats.
 
     Args:
-        cycle: A cycle, from `find_cycle` for example.
+        cycle: A cycle, or a motion of a forced oscillator, from `find_cycle` for example.
 
     Returns:
         The period, in dimensionless time tau.
     """
-    return _checked_cycle(cycle).period
+    return _checked_motion(cycle).period
 
 
-def stick_duration(cycle: Cycle, belt: int | None = None) -> Array:
+def stick_duration(cycle: Cycle | PeriodicMotion, belt: int | None = None) -> Array:
     """Time per loop for which the mass sticks to a belt, summed over its stick phases.
 
     Args:
-        cycle: A cycle, from `find_cycle` for example.
+        cycle: A cycle, or a motion of a forced oscillator, from `find_cycle` for example.
         belt: Number of the belt; None: any belt.
 
     Returns:
@@ -52,16 +52,16 @@ def stick_duration(cycle: Cycle, belt: int | None = None) -> Array:
     """
     if belt is None:
         stuck = jnp.where(_is_stuck(cycle), 1.0, 0.0)
-        return jnp.sum(cycle.unknowns[..., 2] * stuck, axis=-1)
+        return jnp.sum(cycle.unknowns[..., -1] * stuck, axis=-1)
     number = _belt_index(cycle, belt)
     return cycle.stick_durations[..., number]
 
 
-def slip_duration(cycle: Cycle, belt: int | None = None) -> Array:
+def slip_duration(cycle: Cycle | PeriodicMotion, belt: int | None = None) -> Array:
     """Time per loop for which the mass touches a belt and slips on it.
 
     Args:
-        cycle: A cycle, from `find_cycle` for example.
+        cycle: A cycle, or a motion of a forced oscillator, from `find_cycle` for example.
         belt: Number of the belt; None: time for which the mass sticks to no belt.
 
     Returns:
@@ -71,18 +71,18 @@ def slip_duration(cycle: Cycle, belt: int | None = None) -> Array:
         ValueError: If there is no such belt.
     """
     if belt is None:
-        return _checked_cycle(cycle).period - stick_duration(cycle)
+        return _checked_motion(cycle).period - stick_duration(cycle)
     number = _belt_index(cycle, belt)
     codes = cycle.chain.codes[..., number]
     slips = jnp.where(jnp.abs(codes) == 1, 1.0, 0.0)
-    return jnp.sum(cycle.unknowns[..., 2] * slips, axis=-1)
+    return jnp.sum(cycle.unknowns[..., -1] * slips, axis=-1)
 
 
-def stick_fraction(cycle: Cycle, belt: int | None = None) -> Array:
+def stick_fraction(cycle: Cycle | PeriodicMotion, belt: int | None = None) -> Array:
     """Fraction of a loop for which the mass sticks to a belt.
 
     Args:
-        cycle: A cycle, from `find_cycle` for example.
+        cycle: A cycle, or a motion of a forced oscillator, from `find_cycle` for example.
         belt: Number of the belt; None: any belt.
 
     Returns:
@@ -94,31 +94,32 @@ def stick_fraction(cycle: Cycle, belt: int | None = None) -> Array:
     return stick_duration(cycle, belt) / cycle.period
 
 
-def amplitude(cycle: Cycle, coordinate: str = "x1") -> Array:
+def amplitude(cycle: Cycle | PeriodicMotion, coordinate: str = "x1") -> Array:
     """Half the difference of the largest and the smallest value of a coordinate in a loop.
 
     Args:
-        cycle: A cycle, from `find_cycle` for example.
+        cycle: A cycle, or a motion of a forced oscillator, from `find_cycle` for example.
         coordinate: "x1" or "x2".
 
     Returns:
         The amplitude, dimensionless.
     """
-    values = _values(cycle, coordinate)
-    return 0.5 * (jnp.max(values, axis=-1) - jnp.min(values, axis=-1))
+    least, largest = _range(cycle, coordinate)
+    return 0.5 * (largest - least)
 
 
-def peak(cycle: Cycle, coordinate: str = "x1") -> Array:
+def peak(cycle: Cycle | PeriodicMotion, coordinate: str = "x1") -> Array:
     """Largest absolute value of a coordinate in a loop.
 
     Args:
-        cycle: A cycle, from `find_cycle` for example.
+        cycle: A cycle, or a motion of a forced oscillator, from `find_cycle` for example.
         coordinate: "x1" or "x2".
 
     Returns:
         The peak, dimensionless.
     """
-    return jnp.max(jnp.abs(_values(cycle, coordinate)), axis=-1)
+    least, largest = _range(cycle, coordinate)
+    return jnp.maximum(-least, largest)
 
 
 def gap(cycle: Cycle, belt: int) -> Array:
@@ -136,7 +137,7 @@ def gap(cycle: Cycle, belt: int) -> Array:
     Raises:
         ValueError: If there is no such belt.
     """
-    belt = _belt_index(cycle, belt)
+    belt = _belt_index(_checked_cycle(cycle), belt)
     osc = cycle.oscillator
     boundary = osc.belts[belt].velocity / osc.omega
     return jnp.maximum(boundary - cycle.x2_max, cycle.x2_min - boundary)
@@ -184,24 +185,30 @@ MEASURED_IN: dict[Callable[..., Array], str] = {
 }
 
 
-def _checked_cycle(cycle: Any) -> Cycle:
+def _checked_cycle(cycle: Any) -> Any:
     expected = "a Cycle, such as jb.find_cycle(...)"
-    require_value(isinstance(cycle, Cycle), "cycle", expected, cycle)
+    forced = " of an oscillator without forcing" if isinstance(cycle, PeriodicMotion) else ""
+    require_value(isinstance(cycle, Cycle), "cycle", expected + forced, cycle)
     return cycle
 
 
-def _is_stuck(cycle: Cycle) -> Array:
-    return jnp.any(_checked_cycle(cycle).chain.codes == 0, axis=-1)
+def _checked_motion(cycle: Any) -> Cycle | PeriodicMotion:
+    return cycle if isinstance(cycle, PeriodicMotion) else _checked_cycle(cycle)
 
 
-def _belt_index(cycle: Cycle, belt: int) -> int:
-    check_belt(belt, len(_checked_cycle(cycle).oscillator.belts))
+def _is_stuck(cycle: Cycle | PeriodicMotion) -> Array:
+    return jnp.any(_checked_motion(cycle).chain.codes == 0, axis=-1)
+
+
+def _belt_index(cycle: Cycle | PeriodicMotion, belt: int) -> int:
+    check_belt(belt, len(_checked_motion(cycle).oscillator.belts))
     return belt
 
 
-def _values(cycle: Cycle, coordinate: str) -> Array:
-    require_one_of(coordinate, _COORDINATES, "coordinate")
-    return _checked_cycle(cycle).unknowns[..., _COORDINATES[coordinate]]
+def _range(cycle: Cycle | PeriodicMotion, coordinate: str) -> tuple[Array, Array]:
+    require_one_of(coordinate, ("x1", "x2"), "coordinate")
+    motion = _checked_motion(cycle)
+    return getattr(motion, f"{coordinate}_min"), getattr(motion, f"{coordinate}_max")
 
 
 @jit

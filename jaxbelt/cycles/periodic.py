@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -39,6 +40,7 @@ from ..tables import per_belt, require_single, table_of
 from .chains import SIZES, Loop, loop_events
 from .clocked import (
     TimedChain,
+    extrema_along,
     forcing_period,
     least_steps,
     monodromy,
@@ -126,6 +128,26 @@ class PeriodicMotion(eqx.Module):
         return jnp.sum(self.unknowns[..., 3:] * stuck, axis=-2)
 
     @property
+    def x1_min(self) -> Array:
+        """Smallest displacement."""
+        return extrema_of(self)[..., 0]
+
+    @property
+    def x1_max(self) -> Array:
+        """Largest displacement."""
+        return extrema_of(self)[..., 1]
+
+    @property
+    def x2_min(self) -> Array:
+        """Smallest velocity."""
+        return extrema_of(self)[..., 2]
+
+    @property
+    def x2_max(self) -> Array:
+        """Largest velocity."""
+        return extrema_of(self)[..., 3]
+
+    @property
     def stable(self) -> Array:
         """Whether both multipliers are inside of the unit circle."""
         return jnp.all(jnp.abs(self.multipliers) < 1, axis=-1)
@@ -181,7 +203,10 @@ class PeriodicMotion(eqx.Module):
         require_single(self, self.residual, 0)
         known = int(self.status) == Status.OK
         start, (first, second) = np.asarray(self.start), np.asarray(self.multipliers)
+        extrema = np.asarray(extrema_of(self))
         numbers = {
+            **dict(zip(("x1_min", "x1_max", "x2_min", "x2_max"), extrema, strict=True)),
+            "amplitude": 0.5 * (extrema[1] - extrema[0]),
             "period": self.period,
             "x1": start[0],
             "x2": start[1],
@@ -202,9 +227,9 @@ class PeriodicMotion(eqx.Module):
         }
 
     def table(self) -> "pandas.DataFrame":
-        """One row: stable, periods, period, x1 and x2 at the phase 0, real and imaginary parts of
-        both multipliers, stick_duration_0, ... of each belt, residual, iterations, signature,
-        status."""
+        """One row: stable, periods, x1_min, x1_max, x2_min, x2_max, amplitude (half the range of
+        x1), period, x1 and x2 at the phase 0, real and imaginary parts of both multipliers,
+        stick_duration_0, ... of each belt, residual, iterations, signature, status."""
         return table_of([self.row()])
 
     def plot(self, ax: Any = None) -> Any:
@@ -226,6 +251,17 @@ class PeriodicMotion(eqx.Module):
             f"multipliers {told}, {'' if self.stable else 'un'}stable, "
             f"residual {float(self.residual):.1e})"
         )
+
+
+def extrema_of(motion: PeriodicMotion) -> Array:
+    """Smallest and largest x1, and those of x2, of a motion or of each of a batch, [..., 4]."""
+    function = _extrema
+    for _ in range(motion.unknowns.ndim - 2):
+        function = jax.vmap(function)
+    return function(motion.oscillator, motion.chain, motion.unknowns)
+
+
+_extrema = jit(extrema_along)
 
 
 @jit
