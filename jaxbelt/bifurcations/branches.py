@@ -289,6 +289,8 @@ def _past_phase(
     motion = periodic_from(line.at(value), start, last.motion.periods, line.turns)
     if int(motion.status) != Status.OK or motion.periods != last.motion.periods:
         return None
+    if np.array_equal(motion.chain.codes[0], last.motion.chain.codes[0]):
+        return None
     events, before = motion.signature, last.motion.signature
     turns = (before[k:] + before[:k] for k in range(max(1, len(before))))
     apart = np.max(np.abs(start - np.asarray(last.motion.start)))

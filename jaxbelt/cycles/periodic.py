@@ -465,7 +465,7 @@ def nothing_found(osc: Oscillator, turns: int, status: int) -> PeriodicMotion:
 def periodic_from(osc: Oscillator, guess: Any, periods: int, turns: int) -> PeriodicMotion:
     """What `periodic` returns, of a known oscillator in its own units."""
     y = np.asarray(guess, float)
-    motion = None
+    motion, begun_again = None, False
     for _ in range(OUTER_STEPS):
         followed = arcs_over(osc, y, turns)
         if len(followed.starts) <= periods:
@@ -474,7 +474,13 @@ def periodic_from(osc: Oscillator, guess: Any, periods: int, turns: int) -> Peri
         followed = followed.first(periods)
         motion = solved_from(osc, followed.loop(), turns)
         if int(motion.status) in (Status.OK, Status.NEUTRAL):
-            return _of_least_periods(osc, motion, turns)
+            goes_on = np.array_equal(followed.codes[0], followed.codes[-1])
+            if goes_on or begun_again:
+                return _of_least_periods(osc, motion, turns)
+            # It begins in another mode than it ends in: an arc of no duration is before an event.
+            y = after_period(osc, followed._replace(starts=np.asarray(motion.start)[None]))
+            begun_again = True
+            continue
         change = _period_step(osc, followed, turns)
         size = float(np.max(np.abs(change)))
         if not np.isfinite(size):
