@@ -635,7 +635,7 @@ def test_a_diagram_of_a_forced_machine_in_si():
     m, time = shaken(60.0), np.sqrt(MASS / STIFFNESS)
     motion = jb.find_cycle(m.oscillator, m.start(0.0, 0.0))
     by_argument = jb.bifurcation_diagram(
-        lambda f: shaken(f).oscillator, span=(58.0, 62.0), start=motion
+        lambda frequency: shaken(frequency).oscillator, span=(58.0, 62.0), start=motion
     )
     span = 58.0 * time, 62.0 * time
     by_leaf = jb.bifurcation_diagram(
