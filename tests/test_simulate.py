@@ -2,6 +2,7 @@
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -816,3 +817,32 @@ def test_no_samples_in_a_batch():
     assert runs.ys.shape == (2, 0, 2)
     slopes = jax.vmap(jax.jacfwd(lambda nu0: run(nu0).events.t))(jnp.array([0.3, 0.45]))
     assert np.all(np.any(np.nan_to_num(slopes) != 0, axis=1))
+
+
+#: Friction falls within 3e-5 to 1e-4 of the own unit: start, damping, (velocity, load) of belts, and
+#: by the engine of the campaigns the number of events until 50 and the state there.
+THIN = [
+    ((2.487, 0.475), 0.098, [(0.2328, 0.446)], 5, (0.2534408535373042, 0.04556610074149681)),
+    ((-1.35, 0.0), 0.05, [(0.35, 1.0)], 15, (0.25506473732934754, 0.32444510417110334)),
+    ((3.0, 0.0), 0.2, [(-0.55, 1.5), (0.95, 2.0)], 3, (0.2915785057334776, -0.0017051355186067396)),
+]
+
+
+@pytest.mark.parametrize("y0, damping, belts, count, end", THIN)
+def test_a_thin_layer_is_neither_jumped_nor_left_late(y0, damping, belts, count, end):
+    """On the way in the step that ends at the boundary has to see the layer; at slip onset an error
+    grows with exp(t / 1e-4) until the mass has left it."""
+    own = jb.Oscillator(
+        damping,
+        tuple(jb.Belt(v, jb.Stribeck(1.0, 0.6, 1e-4 * abs(v)), load) for v, load in belts),
+    )
+    for tol, room in ((1e-8, 1e-6), (1e-11, 1e-9)):
+        run = jb.simulate(own, y0, 50.0, rtol=tol, atol=tol)
+        assert run.status == Status.OK
+        assert np.sum(np.isfinite(run.events.t)) == count
+        np.testing.assert_allclose(run.ys[-1], end, rtol=0, atol=room)
+    runs = jb.sweep(
+        lambda z: eqx.tree_at(lambda o: o.damping, own, z), {"z": [damping]}, y0=y0, t1=50.0
+    )
+    np.testing.assert_allclose((runs.x1_end[0], runs.x2_end[0]), end, rtol=0, atol=1e-6)
+    assert runs.n_events[0] == count

@@ -43,6 +43,7 @@ from ..model.modes import (
     has_edges,
     mode_acceleration,
     select,
+    share_of_tolerance,
     without_rounding,
 )
 from ..model.oscillator import Oscillator, at_time, fastest, has_possible_numbers
@@ -91,7 +92,7 @@ STRAIGHT_GUARD = 1.0
 TIMED_STAGES = (2, 6, 4, 7, 8, 9, 10, 13)
 
 
-def _of_lanes(function: Callable, osc: Oscillator, *args: Any) -> Any:
+def of_lanes(function: Callable, osc: Oscillator, *args: Any) -> Any:
     """What a function of an oscillator and more gives, lane by lane."""
     axes = jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, osc)
     return jax.vmap(function, in_axes=(axes, *(0 for _ in args)))(osc, *args)
@@ -113,7 +114,7 @@ def timed_lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, t0: Any) ->
         mode = Mode(tuple(code + jnp.zeros(()) for code in mode.codes))
         return mode, focus & jnp.asarray(True), is_held_for_ever(osc, mode, y)
 
-    mode, rests, forever = _of_lanes(start, osc, x1, x2, t)
+    mode, rests, forever = of_lanes(start, osc, x1, x2, t)
     finite = jnp.isfinite(x1) & jnp.isfinite(x2) & has_possible_numbers(osc)
     status = jnp.where(forever, Status.STUCK_FOREVER.value, Status.OK.value)
     status = jnp.where(rests, Status.PSEUDO_FOCUS.value, status)
@@ -228,6 +229,7 @@ def _timed_attempt(
     scale1 = atol + rtol * jnp.maximum(jnp.abs(x1), jnp.abs(y1))
     scale2 = atol + rtol * jnp.maximum(jnp.abs(x2), jnp.abs(y2))
     error1, error2 = jnp.abs(h * h * combine(own.ea, stages)), jnp.abs(h * combine(own.e, stages))
+    scale2 = scale2 * _least_share(osc, lanes, clock, y2 - x2, stages[-1], rtol)
     error = jnp.maximum(error1 * scale2, error2 * scale1) / (scale1 * scale2)
     error = jnp.where(stuck, jnp.where(jnp.isfinite(stages[-1]), 0.0, jnp.inf), error)
     integrals = jax.tree.map(lambda i, *s: i + h * combine(own.a[-1], s), lanes.integrals, *slopes)
@@ -235,6 +237,18 @@ def _timed_attempt(
     rate = jnp.where(stuck, _rate_of_stick(end, mode), stages[-1])
     needed = [stages[i] for i in (0, *TIMED_STAGES)]
     return _TimedAttempt(h, y1, y2, stages[-1], rate, lax.stop_gradient(error), integrals, needed)
+
+
+def _least_share(osc: Oscillator, lanes: Lanes, clock: StepClock, rise, a_end, rtol) -> Array:
+    """The least `share_of_tolerance` of the motions relative to the belts."""
+    shares = [share_of_tolerance(rise, lanes.a, a_end, rtol)]
+    for wave in clock.velocities:
+        if isinstance(wave, StepWave):
+            rates = [wave.rate(c) / osc.omega for c in (0.0, 1.0)]
+            course = (wave.at(1.0) - wave.at(0.0)) / osc.omega
+            a = lanes.a - rates[0], a_end - rates[1]
+            shares.append(share_of_tolerance(rise - course, *a, rtol))
+    return functools.reduce(jnp.minimum, shares)
 
 
 def timed_flown(
@@ -307,9 +321,9 @@ def _quartic(start, end, change, h) -> list[Array]:
 
 
 def _meetings(
-    osc, clock: StepClock, window: TimedWindow, lanes: Lanes, new: _TimedAttempt, rtol, atol
+    osc, clock: StepClock, window: TimedWindow, lanes: Lanes, new: _TimedAttempt, rtol, atol, lands
 ):
-    """What the step has to do with each guard of its mode."""
+    """What the step has to do with each guard of its mode; lands: see `_limit_of_stick`."""
     h, n, ones = clock.h, len(osc.belts), clock.ones
     reach = LANDING * jnp.sqrt(rtol)
     room = LANDS_WITHIN * (atol + rtol * jnp.abs(new.x2)) * h
@@ -360,7 +374,7 @@ def _meetings(
     no = none > 0
     limit = where_any(
         stuck,
-        lambda: _limit_of_stick(osc, clock, window, lanes, new, room, reach),
+        lambda: _limit_of_stick(osc, clock, window, lanes, new, room, reach, lands),
         _GuardMeeting(no, no, none + 1, none + NEVER, jnp.full_like(lanes.hit, 3 * n)),
     )
     asked = stuck & (lanes.status != Status.STUCK_FOREVER.value)
@@ -370,11 +384,12 @@ def _meetings(
 
 
 def _limit_of_stick(
-    osc, clock: StepClock, window, lanes, new: _TimedAttempt, room, reach
+    osc, clock: StepClock, window, lanes, new: _TimedAttempt, room, reach, lands: bool
 ) -> _GuardMeeting:
     """The meeting with a limit of what stuck belts can hold, capacity -+ needed: the nearer one.
 
-    Where it may meet both the step is cut.
+    Where it may meet both the step is cut. lands: whether a step always ends near to the root; else
+    one that holds it may be gone back to it, however far that is.
     """
     own, n, h = nystroem(), len(osc.belts), clock.h
     nodes = tuple(round(float(own.c[i]), 12) for i in (0, *TIMED_STAGES))
@@ -407,7 +422,7 @@ def _limit_of_stick(
     one = _meeting(points, doubt, fuzz, ends, h, room, reach, number)
     both = (jnp.maximum(*least) <= doubt) & (h > SHORTEST_TIMED_STEP * reach)
     one = replace(one, cut=one.cut | both, there=jnp.where(both, 0.5 * one.there, one.there))
-    if any(isinstance(v, StepWave) for v in clock.velocities):
+    if lands or any(isinstance(v, StepWave) for v in clock.velocities):
         return one
     # The way is straight: the state at the root is as good as that at the end.
     _, slope, _ = value_at(points, one.there)
@@ -435,7 +450,8 @@ def take_timed_step(
     h = jnp.where(going, jnp.minimum(jnp.minimum(lanes.h, window.longest), remaining), 0.0)
     clock = StepClock.of(osc, ones, lanes.t, h)
     new = _timed_attempt(osc, clock, window, lanes, rtol, atol, rates)
-    found = _meetings(osc, clock, window, lanes, new, rtol, atol)
+    # Integrals are known at the ends of steps, and near to them.
+    found = _meetings(osc, clock, window, lanes, new, rtol, atol, rates is not None)
     delta = functools.reduce(jnp.minimum, [one.delta for one in found])
     number = first_of(
         [one.delta == delta for one in found], [one.number for one in found], jnp.asarray(-1)
@@ -507,7 +523,7 @@ def pass_timed_events(
     no = jnp.zeros_like(fired)
     state = lanes.x1, lanes.x2, lanes.a, lanes.mode, no, no
     args = lanes.mode, lanes.hit, lanes.x1, lanes.x2, lanes.t
-    passed = where_any(fired, lambda: _of_lanes(through_guard, osc, *args), state)
+    passed = where_any(fired, lambda: of_lanes(through_guard, osc, *args), state)
     x1, x2, a, mode, captured, forever = select(fired, passed, state)
     captured = captured & captures
     # Slip onset is tangent: x2' = 0 there up to rounding, for a law without a jump.

@@ -42,6 +42,7 @@ from ..model.modes import (
     foremost,
     has_edges,
     select,
+    share_of_tolerance,
 )
 from ..model.modes import edges as edge_positions
 from ..model.oscillator import Oscillator, constant_force
@@ -264,6 +265,7 @@ def attempt(
     scale1 = atol + rtol * jnp.maximum(jnp.abs(x1), jnp.abs(y1))
     scale2 = atol + rtol * jnp.maximum(jnp.abs(x2), jnp.abs(y2))
     error1, error2 = jnp.abs(h * h * combine(own.ea, stages)), jnp.abs(h * combine(own.e, stages))
+    scale2 = scale2 * share_of_tolerance(y2 - x2, lanes.a, stages[-1], rtol)
     error = jnp.maximum(error1 * scale2, error2 * scale1) / (scale1 * scale2)
     if derivatives:
         ends = (x1, x2), (y1, y2)

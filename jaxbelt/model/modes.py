@@ -129,6 +129,33 @@ def fastest_rate(a_by_x2: Array) -> Array:
     return jnp.where(half > 1, half + jnp.sqrt(jnp.maximum(half * half - 1, 0.0)), 1.0)
 
 
+#: Time in which x2' grows e-fold in a layer that is thin, and by how many tolerances an error there
+#: may delay the motion; see `share_of_tolerance`.
+LAYER, DELAY = 0.01, 10.0
+#: Rounding of x2 in a step, over x2.
+ROUNDING = 5e-15
+
+
+def share_of_tolerance(rise: Array, a_start: Array, a_end: Array, rtol: ArrayLike) -> Array:
+    """The share of its tolerance that an error of x2 may have, in a step of an integrator.
+
+    It is 1 but in a step out of a thin layer. Slip onset is an unstable point: where the law falls
+    steeply, x2' grows from there like exp(t / LAYER) or faster, and an error of x2 grows with it.
+    What remains of it is a delay, the error over x2', which may be `DELAY` tolerances.
+
+    Args:
+        rise: Change of x2 in the step, relative to the belt where belts move.
+        a_start: x2' at its start, likewise.
+        a_end: x2' at its end, likewise.
+        rtol: The relative tolerance; no error is asked for that is below rounding.
+    """
+    change = jnp.abs(a_end - a_start)
+    grows = (jnp.abs(rise) < LAYER * change) & (jnp.abs(a_end) > jnp.abs(a_start))
+    grows = grows & (a_start * a_end >= 0)
+    share = jnp.maximum(DELAY * change, ROUNDING / rtol)
+    return jnp.where(grows, jnp.minimum(1.0, share), 1.0)
+
+
 def capacity(osc: Oscillator, mode: Mode) -> Array:
     """The largest force that the stuck belts can hold together, the sum of u0_k mus_k."""
     return _of_stuck(osc, mode, [belt.friction.static for belt in osc.belts])

@@ -21,8 +21,8 @@ from jax import lax
 from jaxtyping import Array
 
 from ..model.instants import field_at
-from ..model.modes import Mode, fastest_rate, mode_acceleration
-from ..model.oscillator import Oscillator, at_time, fastest, has_clock
+from ..model.modes import Mode, fastest_rate, mode_acceleration, share_of_tolerance
+from ..model.oscillator import Belt, Oscillator, at_time, fastest, has_clock
 from ..numerics.compiling import the_solvers
 from ..numerics.extrapolation import increments, scheme
 
@@ -116,6 +116,7 @@ def _extrapolation() -> Any:
             best, lower = increments(field, y0, t1 - t0, self.scheme)
             y1 = tuple(a + b for a, b in zip(y0, best, strict=True))
             error = tuple(a - b for a, b in zip(best, lower, strict=True))
+            error = args(y0, y1, t1 - t0, error)
             last = (t0, *y0), (t1, *y1)
             return y1, error, {"y0": y0, "y1": y1}, last, dfx.RESULTS.successful
 
@@ -125,6 +126,8 @@ def _extrapolation() -> Any:
 class Adaptive(AbstractIntegrator):
     """Steps whose error is kept below rtol and atol, for the time `span`; scalars."""
 
+    osc: Oscillator
+    mode: Mode
     span: Array
     rtol: Array
     atol: Array
@@ -165,6 +168,16 @@ class Adaptive(AbstractIntegrator):
             largest = functools.reduce(jnp.maximum, [jnp.abs(part) for part in y])
             return jnp.where(self.span > 0, largest, 0.0)
 
+        layers = _Layers.of(self.osc, self.mode, field, y)
+
+        def error_of(start, end, step, error):
+            """The error of a step, with what thin layers add, in multiples of the tolerance."""
+            share, steps = layers.asked(start, end, self.span * step, self.rtol)
+            tolerance = self.atol + self.rtol * jnp.abs(end[1])
+            jumps = tolerance * ((steps * steps) ** 2) ** 2
+            error = error[0], jnp.maximum(jnp.abs(error[1]) / share, jumps), *error[2:]
+            return lax.stop_gradient(error)
+
         dfx = the_solvers()
         # Where no event is looked for, a step may be as long as its error allows.
         first, longest = (1.0, 1.0) if ends_outside is None else (FIRST_FRACTION, MAX_FRACTION)
@@ -175,6 +188,7 @@ class Adaptive(AbstractIntegrator):
             t1=1.0,
             dt0=first,
             y0=y,
+            args=error_of,
             saveat=dfx.SaveAt(solver_state=True),
             stepsize_controller=dfx.PIDController(
                 rtol=self.rtol, atol=self.atol, dtmax=longest, norm=norm
@@ -188,12 +202,68 @@ class Adaptive(AbstractIntegrator):
         return *last, solution.event_mask
 
 
+def _at(osc: Oscillator, y: State) -> Oscillator:
+    """The oscillator without a clock that it is at a state."""
+    return at_time(osc, y[2]) if has_clock(osc) else osc
+
+
+class _Layers(eqx.Module):
+    """What thin layers of the friction laws at r = 0 ask of steps.
+
+    thickness: over omega, of the layers of the belts that slip; inf where it is no thin one.
+    """
+
+    osc: Oscillator
+    field: Field
+    thickness: tuple[Array, ...]
+
+    @classmethod
+    def of(cls, osc: Oscillator, mode: Mode, field: Field, y: State) -> "_Layers":
+        none = jnp.zeros(())
+        bends = [_bends(belt, none) for belt in _at(osc, y).belts]
+        bends = [
+            jnp.where(jnp.abs(code) == 1, osc.omega * bend, 0.0)
+            for code, bend in zip(mode.codes, bends, strict=True)
+        ]
+        thin = [jnp.where(bend > THIN, 1 / bend, jnp.inf) for bend in bends]
+        return cls(osc, field, tuple(thin))
+
+    def asked(self, start: State, end: State, h: Array, rtol: Array) -> tuple[Array, Array]:
+        """The share of its tolerance that x2 may be off by, see `share_of_tolerance`, and how many
+        steps this one has to be for none to jump a layer: each goes half of the way to it."""
+
+        a, now, later = self.field(start)[1], _at(self.osc, start), _at(self.osc, end)
+        shares, counts = [], []
+        for belt, moved, thickness in zip(now.belts, later.belts, self.thickness, strict=True):
+            gap, gap_end = (
+                x2 - one.velocity / self.osc.omega
+                for x2, one in ((start[1], belt), (end[1], moved))
+            )
+            a_start = a - getattr(belt, "rate", 0.0) / self.osc.omega
+            rise = gap_end - gap
+            a_end = 2 * rise / h - a_start
+            shares.append(share_of_tolerance(rise, a_start, a_end, rtol))
+            way = jnp.where(gap * a_start < 0, h * jnp.abs(a_start), 0.0)
+            counts.append(2 * way / (thickness + jnp.abs(gap)))
+        return functools.reduce(jnp.minimum, shares), functools.reduce(jnp.maximum, counts)
+
+
 # --- steps that are short where the friction law bends --------------------------------------------
 
 
 #: Inverse thickness, in own units, of the thickest layer of a friction law at r = 0 that steps
 #: which do not look for it might jump.
 THIN = 30.0
+
+
+def _bends(belt: Belt, speeds: Array) -> Array:
+    """The inverse lengths sqrt(u0 |mu''|) in which the force of a belt bends, at speeds."""
+
+    def slope(r):
+        return jax.jvp(belt.friction.mu, (r,), (jnp.ones_like(r),))[1]
+
+    curvature = jax.jvp(slope, (speeds,), (jnp.ones_like(speeds),))[1]
+    return jnp.sqrt(jnp.abs(belt.load * curvature))
 
 
 def density(osc: Oscillator, mode: Mode, x1: Array, x2: Array, *t: Array) -> Array:
@@ -209,7 +279,7 @@ def density(osc: Oscillator, mode: Mode, x1: Array, x2: Array, *t: Array) -> Arr
     is small.
     """
     waves = [fastest(osc)] if has_clock(osc) else []
-    osc = at_time(osc, *t) if waves else osc
+    osc = _at(osc, (x1, x2, *t))
     a, a_by_x2 = jax.jvp(
         lambda x2: mode_acceleration(osc, mode, x1, x2), (x2,), (jnp.ones_like(x2),)
     )
@@ -217,12 +287,7 @@ def density(osc: Oscillator, mode: Mode, x1: Array, x2: Array, *t: Array) -> Arr
     for belt, code in zip(osc.belts, mode.codes, strict=True):
         speed = jnp.maximum(jnp.sign(code) * (belt.velocity - osc.omega * x2), 0.0)
 
-        def slope(r, belt=belt):
-            return jax.jvp(belt.friction.mu, (r,), (jnp.ones_like(r),))[1]
-
-        speeds = jnp.stack([speed, jnp.zeros_like(speed)])
-        curvature = jax.jvp(slope, (speeds,), (jnp.ones_like(speeds),))[1]
-        here, at_boundary = jnp.sqrt(jnp.abs(belt.load * curvature))
+        here, at_boundary = _bends(belt, jnp.stack([speed, jnp.zeros_like(speed)]))
         thin = jnp.maximum(0.0, 1.0 - THIN / jnp.maximum(at_boundary, THIN))
         nearing = thin * at_boundary / (1 + at_boundary * speed)
         bend = bend + jnp.where(jnp.abs(code) == 1, jnp.maximum(here, nearing), 0.0)

@@ -95,7 +95,7 @@ def _slip_segment(osc: Oscillator, state: RunState, t1, rtol, atol) -> tuple[Arc
     """A slip arc; and whether the run ends at its end."""
     remaining = t1 - state.t
     span = jnp.minimum(remaining, MAX_ARC)
-    integrator = Adaptive(span, SAFETY * rtol, SAFETY * atol)
+    integrator = Adaptive(osc, state.mode, span, SAFETY * rtol, SAFETY * atol)
     arc = _adaptive_slip_arc(osc, state.mode, state.signs, state.y, integrator)
     # At rest up to rounding the mass stays, even on a guard.
     a = mode_acceleration(osc, state.mode, *arc.y)

@@ -56,7 +56,7 @@ def _flown_in_pieces(osc: Oscillator, rtol, atol, numbers, arcs, since, stuck) -
         entry = tuple(arc.y[i] for i in range(y.size))
         start = select(goes_on, tuple(y[i] for i in range(y.size)), entry)
         duration = jnp.where(stuck, 0.0, since - jnp.where(goes_on, before, 0.0))
-        flown = _slip_flow(osc, mode, start, Adaptive(duration, rtol, atol))
+        flown = _slip_flow(osc, mode, start, Adaptive(osc, mode, duration, rtol, atol))
         if has_clock(osc):
             return jnp.stack(select(stuck, carried(osc, mode, entry, since), flown))
         v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega

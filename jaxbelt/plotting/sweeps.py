@@ -1,6 +1,7 @@
 """Sweeps, and basins of attraction."""
 
 from collections.abc import Sequence
+from itertools import cycle
 from typing import Any
 
 import matplotlib.colors
@@ -16,6 +17,7 @@ from ..checks import require, require_one_of, require_value
 from ..sweeps.basins import Basins, BasinStability, standard_error
 from ..sweeps.datasets import decoded
 from ..sweeps.fractions import BasinFractions
+from ..sweeps.naming import is_cycle
 from ..sweeps.store import Verified
 from ..sweeps.sweep import Explanation
 from .categories import LINE, draw_categories, words_of_runs
@@ -165,6 +167,8 @@ def _with_unit(words: str, attributes: dict[str, Any]) -> str:
 def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:
     """Draws which start leads where, with the cycles; the unstable cycle between basins is dashed.
 
+    Of a forced oscillator it draws the states of its periodic motions at the phase 0.
+
     Basins of cycles are pale blue and green, those of equilibria pale orange, undecided starts
     white. Below the axes is a key, as in `Basins.plot`.
 
@@ -190,13 +194,15 @@ def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:
     ax.set(xlim=(x1[0], x1[-1]), ylim=(x2[0], x2[-1]))
     for colour, name in zip(colours, basins.attractors, strict=True):
         ax.add_patch(Rectangle((0, 0), 0, 0, facecolor=colour, edgecolor="0.4", label=f"to {name}"))
-    plot_phase_portrait(
-        basins.oscillator,
-        cycles=[c for c in (*basins.cycles, basins.boundary) if int(c.status) == 0],
-        xlim=(x1[0], x1[-1]),
-        ylim=(x2[0], x2[-1]),
-        ax=ax,
-    )
+    limits: dict[str, Any] = dict(xlim=(x1[0], x1[-1]), ylim=(x2[0], x2[-1]))
+    cycles = [c for c in (*basins.cycles, basins.boundary) if c is not None and int(c.status) == 0]
+    if basins.boundary is None:
+        for motion, mark in zip(cycles, cycle("osD^v"), strict=False):
+            style = dict(marker=mark, mec="black", mfc="white", ls="none", ms=5)
+            ax.plot(*np.asarray(motion.starts).T, **style, label=f"{motion.periods}-periodic")
+        ax.set(xlabel="displacement $x_1$", ylabel="velocity $x_2$", **limits)
+    else:
+        plot_phase_portrait(basins.oscillator, cycles=cycles, **limits, ax=ax)
     add_key(ax)
     return ax
 
@@ -207,7 +213,7 @@ def _basin_colours(attractors: Sequence[str]) -> list[str]:
         iter(["#B5D6EC", "#A9DCC8", "#D5E8F5", "#8FB8D8", "#7FC4A8"]),
         iter(["#F6C98F", "#F3DCE8", "#F5E9A9", "#E3A56B", "#DDB5CB"]),
     )
-    return [next(cycles if name.startswith("cycle") else others, "#DDDDDD") for name in attractors]
+    return [next(cycles if is_cycle(name) else others, "#DDDDDD") for name in attractors]
 
 
 def draw_basins(basins: Basins) -> Figure:

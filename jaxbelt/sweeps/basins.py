@@ -8,7 +8,6 @@ of labelled grids are their entropy, and the fraction of starts that are near to
 some time. All use the kernel behind `sweep`, where a run ends as soon as its attractor is known.
 """
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -31,19 +30,23 @@ from ..checks import (
     require_value,
     require_wish,
 )
-from ..cycles.attractors import Runs, is_same
+from ..cycles.attractors import Runs
 from ..cycles.cycle import Cycle, cycle_from
+from ..cycles.periodic import PeriodicMotion
 from ..cycles.unstable import from_starts, unstable_cycle
 from ..kernel.lanes import Program
 from ..model.equilibria import EquilibriumKind, equilibria
-from ..model.oscillator import Oscillator, check_oscillator, refuse_clock
+from ..model.oscillator import Oscillator, check_oscillator, has_clock, refuse_clock
 from ..model.own_units import in_given_units, in_own_units, in_units_of_run
 from ..numerics.compiling import compiled_beside
 from ..results import Status, draw
 from ..tables import table_of
 from .attractor import KINDS, Attractor
 from .datasets import decoded, flags
-from .question import LONG_ENOUGH, settings_of_runs
+from .forced_basins import forced_labels
+from .naming import Found, is_cycle, words_for
+from .question import LONG_ENOUGH, as_start, settings_of_runs
+from .strobes import FORCED_KINDS, ForcedAttractor
 from .sweep import sweep
 from .work import results_of
 
@@ -54,6 +57,8 @@ if TYPE_CHECKING:
 
 #: Columns of the table of basins that only cycles have.
 OF_CYCLES = ("x1_min", "x1_max", "x2_min", "x2_max", "period", "multiplier")
+#: And those of periodic motions.
+OF_MOTIONS = ("periods", "period", "x1", "x2", "multiplier_0", "multiplier_1")
 
 
 class BasinEntropy(NamedTuple):
@@ -72,15 +77,17 @@ class Basins(eqx.Module):
             observe="attractor")`, and `label`, the number of the attractor, from 0, the most
             frequent first (-1: undecided).
         attractors: A few words for each label.
-        cycles: Those of the attractors that are cycles, in the same order.
-        boundary: The unstable cycle, with the status NO_UNSTABLE_CYCLE where there is none.
+        cycles: Those of the attractors that are cycles, in the same order; of a forced oscillator
+            the `PeriodicMotion`s.
+        boundary: The unstable cycle, with the status NO_UNSTABLE_CYCLE where there is none; None
+            for a forced oscillator.
     """
 
     oscillator: Oscillator
     dataset: "xarray.Dataset" = eqx.field(static=True)
     attractors: tuple[str, ...] = eqx.field(static=True)
-    cycles: tuple[Cycle, ...]
-    boundary: Cycle
+    cycles: tuple[Cycle | PeriodicMotion, ...]
+    boundary: Cycle | None
 
     @property
     def label(self) -> "xarray.DataArray":
@@ -145,6 +152,7 @@ class Basins(eqx.Module):
         Raises:
             ValueError: If an argument is not positive.
         """
+        refuse_clock(self.oscillator, "finite_time_stability", 'observe="final" of jb.sweep')
         t, within = as_positive(t, "t"), as_positive(within, "within")
         settings = {name: self.dataset.attrs.get(name) for name in ("rtol", "atol")}
         axes = {name: self.dataset[name].values for name in ("x1", "x2")}
@@ -170,25 +178,26 @@ class Basins(eqx.Module):
         """Returns a row for each attractor, and one for undecided starts.
 
         Columns: label, attractor (its words), fraction of the starts, and for a cycle x1_min,
-        x1_max, x2_min, x2_max, period, multiplier and signature. The last row is the unstable
+        x1_max, x2_min, x2_max, period, multiplier and signature; of a forced oscillator periods,
+        period, x1 and x2 at the phase 0, multipliers and signature. The last row is the unstable
         cycle, label -2, where there is one. `basins.dataset.to_dataframe()` has a row for every
         start.
         """
         labels, cycles = np.asarray(self.label), iter(self.cycles)
         rows = []
         for number, name in enumerate(self.attractors):
-            of_cycle = next(cycles).row() if name.startswith("cycle") else {}
-            rows.append((number, name, of_cycle))
+            rows.append((number, name, next(cycles).row() if is_cycle(name) else {}))
         rows.append((-1, "undecided", {}))
-        if int(self.boundary.status) == Status.OK:
+        if self.boundary is not None and int(self.boundary.status) == Status.OK:
             rows.append((-2, "unstable cycle", self.boundary.row()))
+        columns = OF_MOTIONS if has_clock(self.oscillator) else OF_CYCLES
         return table_of(
             [
                 {
                     "label": number,
                     "attractor": name,
                     "fraction": float(np.mean(labels == number)),
-                    **{key: of_cycle.get(key, np.nan) for key in OF_CYCLES},
+                    **{key: of_cycle.get(key, np.nan) for key in columns},
                     "signature": of_cycle.get("signature", ""),
                 }
                 for number, name, of_cycle in rows
@@ -245,7 +254,8 @@ class BasinStability(eqx.Module):
     fraction below 3/n, with a confidence of 95 per cent.
 
     Attributes:
-        fractions: Dictionary with the keys "equilibrium", "cycle", "stuck" and "undecided".
+        fractions: Dictionary with the keys "equilibrium", "cycle", "stuck" and "undecided"; of a
+            forced oscillator "periodic", "quasiperiodic", "chaotic" in place of "cycle".
         standard_errors: Standard errors, with the same keys.
         n: Number of starts.
     """
@@ -298,17 +308,25 @@ def basins(
     x1: ArrayLike | Sequence[float],
     x2: ArrayLike | Sequence[float],
     t1: float = LONG_ENOUGH,
+    t0: float = 0.0,
     rtol: float = 1e-8,
     atol: float | None = None,
     progress: bool | None = None,
 ) -> Basins:
     """Labels a grid of starts by their attractors, and finds the unstable cycle between them.
 
+    Of a forced oscillator the starts are at the time t0, and nothing is looked for between the
+    basins, which may have fractal boundaries. Its attractors are periodic motions, by their number
+    of periods of the forcing, chaotic and quasiperiodic ones; all of these last two are one label
+    each.
+
     Args:
         oscillator: The oscillator.
         x1: Displacements of the starts, increasing, [n], dimensionless.
         x2: Velocities of the starts, increasing, [m], dimensionless.
-        t1: Time at which a run that has reached no attractor is given up.
+        t1: Time at which a run that has reached no attractor is given up; of one that is forced its
+            exponent then decides.
+        t0: Time of the starts, for a forced oscillator.
         rtol: Relative tolerance of a step, as in `sweep`.
         atol: Absolute tolerance of a step, as in `sweep`.
         progress: Whether to show a bar, as in `sweep`.
@@ -320,40 +338,65 @@ def basins(
         ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(oscillator, "oscillator")
-    refuse_clock(oscillator, "basins", "jb.sweep with axes x1 and x2")
     axes = {name: _starts_along(values, name) for name, values in (("x1", x1), ("x2", x2))}
     require_wish(progress, "progress")
+    numbers = {"t1": t1, "rtol": rtol, "atol": atol}
+    if has_clock(oscillator):
+        return _forced_basins(oscillator, axes, progress, numbers | {"t0": t0})
+    require(t0 == 0.0, "t0", "0 for an oscillator that does not know the time", t0)
     with Activity("basins", progress):
         own = in_own_units(oscillator)
         start = jnp.asarray(np.zeros(2))
         ahead = [lambda: cycle_from(own, start), lambda: from_starts(own)]
         with compiled_beside("basins", own, ahead):
-            dataset = sweep(
-                lambda: oscillator,
-                axes,
-                t1=t1,
-                rtol=rtol,
-                atol=atol,
-                observe="attractor",
-            )
+            dataset = sweep(lambda: oscillator, axes, observe="attractor", **numbers)
         note_progress("telling the attractors apart")
-        labels, attractors, cycles = _labels(oscillator, dataset)
+        found = _labels(oscillator, dataset)
         # With one attractor there is hardly an unstable cycle, and a search among all cycles takes
         # time.
-        boundary = (unstable_cycle if len(attractors) > 1 else from_starts)(own)
+        boundary = (unstable_cycle if len(found) > 1 else from_starts)(own)
         boundary = in_given_units(boundary, oscillator, own)
+    cycles = [in_given_units(one.cycle, oscillator, own) for one in found if one.cycle is not None]
+    return _labelled(oscillator, dataset, found, cycles, boundary)
+
+
+def _forced_basins(osc: Oscillator, axes: Any, progress: Any, numbers: Any) -> Basins:
+    with Activity("basins", progress):
+        dataset = sweep(lambda: osc, axes, observe="attractor", **numbers)
+        note_progress("telling the attractors apart")
+        found = sorted(forced_labels(osc, dataset), key=_rarity)
+    cycles = [one.cycle for one in found if one.cycle is not None]
+    return _labelled(osc, dataset, found, cycles, None)
+
+
+def _rarity(one: Found) -> int:
+    return -int(np.sum(one.runs))
+
+
+def _labelled(
+    oscillator: Oscillator,
+    dataset: "xarray.Dataset",
+    found: Sequence[Found],
+    cycles: Sequence[Any],
+    boundary: Cycle | None,
+) -> Basins:
+    """The basins of the attractors that were found, the most frequent first."""
+    labels = np.full(dataset["kind"].shape, -1, "int32")
+    for i, one in enumerate(found):
+        labels[one.runs] = i
+    attractors = tuple(one.name for one in found)
     dataset["label"] = (
         ("x1", "x2"),
         labels,
         {"long_name": "number of the attractor"}
         | flags({-1: "undecided", **dict(enumerate(attractors))}, "int32"),
     )
-    known = (name for name in ("t1", "rtol", "atol") if name in dataset.attrs)
+    known = (name for name in ("t1", "t0", "rtol", "atol") if name in dataset.attrs)
     settings = ", ".join(f"{name}={dataset.attrs[name]!r}" for name in known)
     dataset.attrs["call"] = (
         f'jaxbelt.basins(oscillator, x1=dataset["x1"], x2=dataset["x2"], {settings})'
     )
-    return Basins(oscillator, dataset, attractors, cycles, boundary)
+    return Basins(oscillator, dataset, attractors, tuple(cycles), boundary)
 
 
 def _starts_along(values: Any, name: str) -> np.ndarray:
@@ -366,18 +409,15 @@ def _starts_along(values: Any, name: str) -> np.ndarray:
     return along
 
 
-def _labels(
-    osc: Oscillator, dataset: "xarray.Dataset"
-) -> tuple[np.ndarray, tuple[str, ...], tuple[Cycle, ...]]:
-    """Numbers of the attractors, the most frequent first, their names, and those that are
-    cycles."""
+def _labels(osc: Oscillator, dataset: "xarray.Dataset") -> list[Found]:
+    """The attractors that runs lead to, the most frequent first, their cycles in own units."""
     kinds = np.asarray(decoded(dataset[["kind"]])["kind"])
     sticks = np.asarray(dataset["sticks"]).astype(bool)
     low, high = np.asarray(dataset["x1_min"]), np.asarray(dataset["x1_max"])
     rest, held, _ = rest_reached(osc, 0.5 * (low + high))
     runs = Runs.of(dataset, ("x1", "x2"))
     own, length = in_own_units(osc, np.asarray(dataset.attrs["length"])), dataset.attrs["length"]
-    found: list[_Found] = []
+    found: list[Found] = []
     unlabelled = kinds != "undecided"
     while np.any(unlabelled):
         first = tuple(int(i) for i in np.unravel_index(np.argmax(unlabelled), unlabelled.shape))
@@ -395,28 +435,10 @@ def _labels(
             same &= np.all(sticks == stuck, axis=-1) & (place == place[first])
         unlabelled &= ~same
         if before is None:
-            found.append(_Found(_words_for(kind, stuck, rest[first], length), same, cycle))
+            found.append(Found(words_for(kind, stuck, rest[first], length), same, cycle))
         else:
             before.runs[same] = True
-    found.sort(key=lambda one: -int(np.sum(one.runs)))
-    labels = np.full(kinds.shape, -1, "int32")
-    for i, one in enumerate(found):
-        labels[one.runs] = i
-    cycles = tuple(in_given_units(one.cycle, osc, own) for one in found if one.cycle is not None)
-    return labels, tuple(one.name for one in found), cycles
-
-
-class _Found(NamedTuple):
-    """An attractor: its name, the runs that lead to it, and the cycle that shooting finds, if it
-    is one."""
-
-    name: str
-    runs: np.ndarray
-    cycle: Cycle | None
-
-    def is_of(self, cycle: Cycle) -> bool:
-        """Whether it is that cycle."""
-        return self.cycle is not None and is_same(self.cycle, cycle)
+    return sorted(found, key=_rarity)
 
 
 #: Runs end no farther from the equilibrium that captures them, in own units.
@@ -454,17 +476,6 @@ def rest_reached(osc: Oscillator, x1: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return rest, segment, ends
 
 
-def _words_for(kind: str, sticks: np.ndarray, x1: float, length: float) -> str:
-    belts = " and ".join(f"belt {i}" for i in np.flatnonzero(sticks))
-    if kind == "equilibrium":
-        # To a thousandth of the own unit of length.
-        decimals = 3 - math.floor(math.log10(length) + 0.5)
-        return f"rest at {x1:.{decimals}f}" if 0 < decimals <= 6 else f"rest at {x1:.4g}"
-    if kind == "stuck":
-        return f"stuck to {belts}" if belts else "stuck"
-    return f"cycle that sticks to {belts}" if belts else "cycle that never sticks"
-
-
 @announced("basin_stability")
 @outside_of_traces
 def basin_stability(
@@ -474,6 +485,7 @@ def basin_stability(
     n: int = 10_000,
     key: Array,
     t1: float = LONG_ENOUGH,
+    t0: float = 0.0,
     rtol: float = 1e-8,
     atol: float | None = None,
 ) -> BasinStability:
@@ -487,6 +499,7 @@ def basin_stability(
         n: Number of starts, drawn uniformly.
         key: Random key, from `jax.random.key`.
         t1: Time at which a run that has reached no attractor is given up.
+        t0: Time of the starts, for a forced oscillator.
         rtol: Relative tolerance of a step, as in `sweep`.
         atol: Absolute tolerance of a step, as in `sweep`.
 
@@ -497,12 +510,14 @@ def basin_stability(
         ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(oscillator, "oscillator")
-    refuse_clock(oscillator, "basin_stability", "jb.sweep with axes x1 and x2")
     corners, n = as_box(box), as_whole(n, "n")
     check_key(key)
     numbers = settings_of_runs(t1, rtol, atol)
+    names: tuple[str, ...] = KINDS
+    if has_clock(oscillator):
+        names, numbers["t0"] = FORCED_KINDS, as_start(t0, numbers["t1"])
     kinds = _kinds(oscillator, starts_in(corners, n, key), **numbers)
-    fractions = {name: float(np.mean(kinds == i)) for i, name in enumerate(KINDS)}
+    fractions = {name: float(np.mean(kinds == i)) for i, name in enumerate(names)}
     errors = {name: float(standard_error(f, n)) for name, f in fractions.items()}
     return BasinStability(fractions, errors, n)
 
@@ -532,14 +547,15 @@ def check_key(key: Any) -> None:
     require_value(typed or raw, "key", "one key, such as jax.random.key(0)", key)
 
 
-def _kinds(osc: Oscillator, starts: np.ndarray, t1, rtol, atol) -> np.ndarray:
-    """Numbers of `attractor.KINDS` for starts [2, n], in the order of the starts."""
+def _kinds(osc: Oscillator, starts: np.ndarray, **numbers: Any) -> np.ndarray:
+    """Numbers of the kinds of attractors for starts [2, n], in the order of the starts."""
     leaves, structure = jax.tree.flatten(in_units_of_run(osc))
     edges = bool(np.any([np.isfinite([belt.lower, belt.upper]) for belt in osc.belts]))
-    program = Program(structure, (False,) * len(leaves), Attractor(), edges)
+    observer = ForcedAttractor() if has_clock(osc) else Attractor()
+    program = Program(structure, (False,) * len(leaves), observer, edges)
 
     def rows_of(first: int, last: int) -> np.ndarray:
         return starts[None, :, first:last]
 
     n = starts.shape[1]
-    return results_of(program, leaves, rows_of, n, t1=t1, rtol=rtol, atol=atol)["kind"].astype(int)
+    return results_of(program, leaves, rows_of, n, **numbers)["kind"].astype(int)

@@ -35,13 +35,18 @@ from .grid import Grid
 from .moments import AtEvents, checked
 from .observers import Final, Reduce
 from .reducers import check_reducer
+from .strobes import ForcedAttractor, LargestExponent
 
 #: Default t1 of attractor runs: some 500 loops; nearly all runs are decided long before.
 LONG_ENOUGH = 30_000.0
 #: Observers that have a name.
 NAMED: dict[str, type[Observer]] = {"final": Final, "attractor": Attractor}
 #: And those where the oscillators know the time.
-NAMED_FORCED: dict[str, type[Observer]] = {"final": Final}
+NAMED_FORCED: dict[str, type[Observer]] = {
+    "final": Final,
+    "attractor": ForcedAttractor,
+    "lyapunov": LargestExponent,
+}
 #: Largest number of points of the grid that identify `make`; the same on every machine.
 SAMPLE = 2**14
 
@@ -206,8 +211,8 @@ def _observer(observe: Any, clock: bool) -> Observer:
         return observe
     known = NAMED_FORCED if clock else NAMED
     if isinstance(observe, str):
-        instead = "for oscillators without a clock; of one that is forced use jb.find_cycle"
-        require(not (clock and observe == "attractor"), "observe", instead, '"attractor"')
+        instead = "for oscillators that are forced; of a cycle ask the multiplier of jb.find_cycle"
+        require(clock or observe != "lyapunov", "observe", instead, '"lyapunov"')
         require_one_of(observe, known, "observe", " or an object with init, update, finish")
         return known[observe]()
     methods = ("init", "update", "finish")
@@ -217,8 +222,6 @@ def _observer(observe: Any, clock: bool) -> Observer:
     expected = f"{names} or an object with init, update, finish"
     require_value(fits, "observe", expected, observe)
     if hasattr(observe, "at") or hasattr(observe, "rates"):
-        told = "without `rates` where the oscillators are forced"
-        require(not (clock and hasattr(observe, "rates")), "observe", told, type(observe).__name__)
         checked(getattr(observe, "at", (AtEvents(),)))
         return Along(observe)
     return Reduce(observe)

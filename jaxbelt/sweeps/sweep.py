@@ -27,11 +27,11 @@ from ..checks import (
 from ..model.oscillator import Oscillator
 from ..results import draw
 from ..tables import table_of
-from .along import Along
+from .attractor import Attractor
 from .audit import chosen, differing
 from .clusters import check_executor, do_on_cluster
 from .datasets import Memory
-from .observers import Reduce
+from .observers import Final
 from .progress import SweepProgress
 from .question import Question
 from .store import Store, blocks_of
@@ -80,7 +80,15 @@ def sweep(
       it was reached), n_events (of a cycle in one loop, else until it was known). An undecided run
       has no attractor: all of these are NaN, sticks is false, signature "none", and n_events those
       of the run. Runs end as soon as their attractor is known, see `attractor.Attractor`.
-      Not for oscillators that are forced.
+      Of oscillators that are forced: kind (periodic, stuck, equilibrium; and, where no period is
+      found until t1, chaotic, quasiperiodic or undecided by the largest exponent), periods (of the
+      forcing, until the motion repeats), sticks(belt), period, stick_duration(belt) and the extrema
+      in it, x1_strobe and x2_strobe (its state at the phase 0 where x1 is largest, a guess for
+      `periodic`), exponent and exponent_error (where no period is found), transient, n_events; see
+      `strobes.ForcedAttractor`. Without a period NaN stands for what belongs to one.
+    - `"lyapunov"`, of oscillators that are forced: exponent, the largest Lyapunov exponent per unit
+      of time, from the last three quarters of the run, exponent_error, its standard error from 25
+      parts of these, n_events.
     - an object with three methods for scalars: `init(osc, x1, x2)` returns the state of a run, any
       tree of arrays; `update(state, event)` the state after an `observers.RunEvent` (t, x1, x2,
       kind, belt); `finish(state, end)` a dictionary of results, numbers or vectors, from the state
@@ -88,7 +96,7 @@ def sweep(
       attribute `at`, a tuple of the moments `AtEvents()`, `AtExtrema("x1")`, `AtSection(function)`,
       `AtTimes(times)` and, with forcing, `AtPhase(phase)`, `update` is called at these; with a
       method `rates(osc, motion)`, which returns a tree of numbers, their integrals are in
-      event.integrals and end.integrals, see `along.Motion`; not with forcing.
+      event.integrals and end.integrals, see `along.Motion`.
     - a `lanes.Observer`, the base class of the first two.
 
     Args:
@@ -133,9 +141,9 @@ def sweep(
         audit = float(as_array(audit, "audit"))
         require(0 <= audit <= 1, "audit", "a share from 0 to 1", audit)
         require(
-            audit == 0 or not isinstance(question.program.observer, Reduce | Along),
+            audit == 0 or isinstance(question.program.observer, Final | Attractor),
             "audit",
-            '0 but for observe="final" and "attractor"',
+            '0 but for "final", and for "attractor" without forcing',
             audit,
         )
         require_wish(progress, "progress")

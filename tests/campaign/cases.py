@@ -147,7 +147,7 @@ def _intervals(rng, n, number):
             if a == b:
                 b = a + 1.0
             cuts.append([(a, b), (a, inf), (-inf, b), (-inf, inf)][rng.integers(4)])
-    return [cuts[i] for i in range(n)]
+    return [cuts[i % len(cuts)] for i in range(n)]
 
 
 def random_case(rng, structure, T=50.0):

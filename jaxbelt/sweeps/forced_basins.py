@@ -1,0 +1,68 @@
+"""Labels of starts by the attractors of a forced oscillator; see `basins.basins`.
+
+Runs lead to one periodic motion if Newton's method, from their states at a strobe, finds one; runs
+whose states are equal within their errors are asked once. Chaotic motions are one label together,
+and so are quasiperiodic ones: no number of theirs tells two of them apart.
+"""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..cycles.attractors import RUN, distance
+from ..cycles.clocked import turns_of
+from ..cycles.periodic import PeriodicMotion, nothing_found, periodic
+from ..model.oscillator import Oscillator
+from ..results import Status
+from .datasets import decoded
+from .naming import Found, words_for
+
+if TYPE_CHECKING:
+    import xarray
+
+#: The state at the strobe, and extents: where these agree runs lead to one motion.
+PLACES = ("x1_min", "x1_max", "x2_min", "x2_max", "x1_strobe", "x2_strobe")
+#: A motion is that of a run if its state at the strobe is this near, over its size.
+OF_RUN = 1e-3
+
+
+def forced_labels(osc: Oscillator, dataset: "xarray.Dataset") -> list[Found]:
+    """The attractors that runs lead to, each with its runs."""
+    kinds = np.asarray(decoded(dataset[["kind"]])["kind"])
+    columns = [np.asarray(dataset[name]) for name in PLACES]
+    places, periods = np.nan_to_num(np.stack(columns, axis=-1)), np.asarray(dataset["periods"])
+    sticks = np.asarray(dataset["sticks"]).astype(bool)
+    error = RUN * float(dataset.attrs["rtol"])
+    found: list[Found] = []
+    unlabelled = kinds != "undecided"
+    while np.any(unlabelled):
+        first = tuple(int(i) for i in np.unravel_index(np.argmax(unlabelled), unlabelled.shape))
+        kind, stuck, motion, before = kinds[first], sticks[first], None, None
+        same = unlabelled & (kinds == kind) & np.all(sticks == stuck, axis=-1)
+        if kind == "periodic":
+            same &= periods == periods[first]
+            same &= distance(places, places[first]) < error
+            motion = _motion_of(osc, places[first], int(periods[first]))
+            before = next((one for one in found if one.is_of(motion)), None)
+        elif kind == "equilibrium":
+            same &= distance(places, places[first], float(dataset.attrs["length"])) < error
+        unlabelled &= ~same
+        if before is None:
+            word = f"{periods[first]}-periodic" if kind == "periodic" else kind
+            name = words_for(word, stuck, places[first][0], float(dataset.attrs["length"]))
+            found.append(Found(name, same, motion))
+        else:
+            before.runs[same] = True
+    return found
+
+
+def _motion_of(osc: Oscillator, place: np.ndarray, n: int) -> PeriodicMotion:
+    """The motion that a run has come to; with the status NO_CONVERGENCE where Newton's method leads
+    to none, or to another."""
+    motion = periodic(osc, place[4:], periods=n)
+    if int(motion.status) == Status.OK:
+        size = max(float(np.ptp(place[:2])), float(np.ptp(place[2:4])))
+        gaps = np.max(np.abs(np.asarray(motion.starts) - place[4:]), axis=-1)
+        if np.min(gaps) <= OF_RUN * size:
+            return motion
+    return nothing_found(osc, turns_of(osc), Status.NO_CONVERGENCE.value)

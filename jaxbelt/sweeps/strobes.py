@@ -1,0 +1,548 @@
+"""Observers of forced runs that look once in each period of the forcing: labels and exponents.
+
+At these moments, the strobes, everything that knows the time is as it was a period before: a motion
+repeats if its state at a strobe is that at an earlier one. `ForcedAttractor` looks for such repeats
+and ends a run as soon as it knows one; `LargestExponent` goes on to the end of the run. Both carry
+a tangent along, from whose growth the largest Lyapunov exponent follows:
+
+- along a slip arc a tangent d solves d1' = d2, d2' = -d1 + c(t) d2 with c the derivative of x2' by
+  x2. Each half step is made by the exponential of Magnus's series of order four, with c at its ends
+  and in its middle; the trace of the matrix leaves the exponential and is added to the logarithm.
+- at an event d jumps by the saltation of the guard h that fires: d_tau = -(h_x d) / (h_t + h_x f-),
+  d+ = d + (f- - f+) d_tau, with the fields f before and behind. Behind a stick phase d2 = 0.
+
+Magnus's series: S. Blanes, F. Casas, J. A. Oteo, J. Ros, Physics Reports 470, 2009, 151, sec. 5.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..kernel.clocked import of_lanes
+from ..kernel.lanes import Lanes, Observer, Variable, choose, materialise
+from ..model.instants import field_at, guards_at
+from ..model.modes import Mode, mode_acceleration
+from ..model.oscillator import at_time, frequencies
+from ..model.own_units import OwnOscillator
+from ..numerics.compiling import where_any
+from ..results import Status
+from .moments import Course
+
+#: Kinds of attractors of forced oscillators, in the order of their codes.
+FORCED_KINDS = ("undecided", "periodic", "quasiperiodic", "chaotic", "stuck", "equilibrium")
+UNDECIDED, PERIODIC, QUASIPERIODIC, CHAOTIC, STUCK_FOR_EVER, EQUILIBRIUM = range(6)
+
+#: Most turns of the first force that are searched for a period that all frequencies have in common,
+#: and how far from whole the turns of the others may be.
+MOST_TURNS, WHOLE = 24, 1e-12
+#: States at two strobes are the same if they differ by less than this, over the size of the motion.
+SAME = 1e-6
+#: Differences below so many tolerances of a step are its errors.
+ERRORS = 10.0
+#: Strobes over which a motion has to repeat, twice its period at least, before it is periodic.
+CONFIRMED = 16
+#: A point of the motion is another one where it is so many times as far away as the motion still
+#: has to go, and so many times as far as errors.
+APART, APART_OF_ERRORS = 10.0, 1000.0
+#: Strobes after which a state is no longer waited for at first; then twice as many, and so on.
+PATIENCE = 8
+#: Share of a run before its exponent is measured; blocks whose means tell the standard error.
+TRANSIENT, BLOCKS = 0.25, 25
+#: Standard errors within which an exponent is zero; per period the error of its computation, and how
+#: large both may be together where a motion is quasiperiodic.
+DEVIATIONS, COMPUTED, RESOLVED = 3.0, 1e-4, 0.01
+#: An extremum is known from a point that is this near in time; steps are cut until there is one.
+NEAR, LEAST_CUT = 1e-3, 1e-3
+
+
+class _Repeats(eqx.Module):
+    """The search for a repeat, arrays [lanes].
+
+    x1, x2: the state that later ones are compared with, of the strobe `at`; patience: strobes until
+    it is given up; n: strobes after which the motion seems to repeat, 0: not yet; confirmed:
+    strobes over which it has; moved: how far the last repeat was from its own; nearest: the
+    smallest distance of another strobe.
+    """
+
+    x1: Array
+    x2: Array
+    at: Array
+    patience: Array
+    n: Array
+    confirmed: Array
+    moved: Array
+    nearest: Array
+
+
+class _Extent(eqx.Module):
+    """What is known of the motion since the state of `_Repeats`, arrays [lanes].
+
+    low, high: least and largest (x1, x2); sticks: time stuck to each belt; events: their number at
+    the beginning; top: the strobe with the largest x1, (x1, x2).
+    """
+
+    low: tuple[Array, Array]
+    high: tuple[Array, Array]
+    sticks: tuple[Array, ...]
+    events: Array
+    top: tuple[Array, Array]
+
+    @classmethod
+    def none(cls, lanes: Lanes, belts: int) -> "_Extent":
+        zero, state = jnp.zeros_like(lanes.t), (lanes.x1, lanes.x2)
+        return cls(state, state, (zero,) * belts, lanes.events, (zero - jnp.inf, zero))
+
+    def with_point(self, x1: Array, x2: Array) -> "_Extent":
+        lows = zip(self.low, (x1, x2), strict=True)
+        highs = zip(self.high, (x1, x2), strict=True)
+        low = tuple(jnp.minimum(a, b) for a, b in lows)
+        high = tuple(jnp.maximum(a, b) for a, b in highs)
+        return replace(self, low=low, high=high)
+
+
+class _Growth(eqx.Module):
+    """The tangent and the logarithms of its growth, arrays [lanes].
+
+    d1, d2: the tangent; log: of what is no longer in it, since the present block began, at `since`;
+    began: the time at which the run did; blocks: how many are done, -1 before the first; total,
+    squares: sums of the rates of growth in them, and of their squares; sticks: whether the mass
+    stuck since the first block began.
+    """
+
+    d1: Array
+    d2: Array
+    log: Array
+    since: Array
+    began: Array
+    blocks: Array
+    total: Array
+    squares: Array
+    sticks: Array
+
+
+class _Seen(eqx.Module):
+    """Memory of the observers, arrays [lanes].
+
+    strobes: number of the next strobe, counted from t = 0; turns: of the first force from one to
+    the next, 0: the frequencies have no period in common. kind, periods: of the attractor, once
+    known; transient: the time when it was.
+    """
+
+    strobes: Array
+    turns: Array
+    repeats: _Repeats
+    extent: _Extent
+    growth: _Growth
+    kind: Array
+    periods: Array
+    transient: Array
+
+
+class Strobed(Observer):
+    """What the observers of this module have in common."""
+
+    #: Whether a run ends as soon as it is known to repeat.
+    decides: ClassVar[bool] = True
+
+    def start(self, osc, lanes):
+        zero, count = jnp.zeros_like(lanes.t), jnp.zeros_like(lanes.events)
+        first, *others = frequencies(osc)
+        turns = count
+        for m in reversed(range(1, MOST_TURNS + 1)):
+            whole = jnp.ones_like(lanes.done)
+            for other in others:
+                ratio = m * other / first
+                whole = whole & (jnp.abs(ratio - jnp.round(ratio)) <= WHOLE * m)
+            turns = jnp.where(whole, m, turns)
+        turns = turns.astype(count.dtype)
+        passed = jnp.floor(lanes.t / _period(osc, turns) * (1 + 1e-14) + 1e-12)
+        nowhere = zero + jnp.nan
+        start = jnp.full_like(count, -1)
+        repeats = _Repeats(
+            nowhere, nowhere, start, count + PATIENCE, count, count, zero, zero + jnp.inf
+        )
+        growth = _Growth(
+            d1=zero + np.cos(1.0),
+            d2=zero + np.sin(1.0),
+            log=zero,
+            since=lanes.t,
+            began=lanes.t,
+            blocks=count - 1,
+            total=zero,
+            squares=zero,
+            sticks=zero > 0,
+        )
+        return _Seen(
+            strobes=(passed + 1).astype(count.dtype),
+            turns=turns,
+            repeats=repeats,
+            extent=_Extent.none(lanes, len(osc.belts)),
+            growth=growth,
+            kind=count,
+            periods=count,
+            transient=nowhere,
+        )
+
+    # --- steps
+
+    def follow(self, take_step, osc, window, ones, lanes, t1, rtol, atol):
+        seen: _Seen = lanes.memory
+        strobe = seen.strobes.astype(lanes.t.dtype) * _period(osc, seen.turns)
+        until = jnp.where(strobe > lanes.t, jnp.minimum(t1, strobe), t1)
+        new = take_step(osc, window, ones, lanes, until, rtol, atol)
+        stuck = lanes.mode.any_stuck
+        h = materialise(new.t - lanes.t, ones)
+        course = Course.of_step(
+            (lanes.x1, lanes.x2, lanes.a), (new.x1, new.x2, new.a), jnp.where(stuck, 0.0, h)
+        )
+        extent = self._extended(seen.extent, lanes, new, stuck, h)
+        if self.decides:
+            theta = self._cut(seen, lanes, new, course, stuck, h, ones)
+            cut = theta < 1
+            new = choose(cut, replace(lanes, h=theta * h), new)
+            h = jnp.where(cut, 0.0, h)
+            extent = choose(cut, seen.extent, extent)
+        growth = _grown(osc, seen.growth, lanes, course, stuck, h, ones)
+        due = (h > 0) & (new.t >= strobe) & (seen.turns > 0)
+        memory = self._strobed(replace(seen, extent=extent, growth=growth), new, due, rtol)
+        return replace(new, memory=memory)
+
+    def _extended(self, extent: _Extent, lanes: Lanes, new: Lanes, stuck, h) -> _Extent:
+        """The extent with a step: its ends, and extrema that are near one of them."""
+        sticks = tuple(
+            total + jnp.where(one, h, 0.0)
+            for total, one in zip(extent.sticks, lanes.mode.stuck, strict=True)
+        )
+        extent = replace(extent, sticks=sticks).with_point(new.x1, new.x2)
+        jerk = (new.a - lanes.a) / jnp.where(h > 0, h, 1.0)
+        for one in (lanes, new):
+            way1 = _way_to_zero(one.x2, one.a, h)
+            x1 = one.x1 + way1 * (one.x2 + 0.5 * way1 * one.a)
+            way2 = _way_to_zero(one.a, jerk, h)
+            x2 = one.x2 + way2 * (one.a + 0.5 * way2 * jerk)
+            slips = ~stuck & (h > 0)
+            extent = extent.with_point(jnp.where(slips, x1, one.x1), jnp.where(slips, x2, one.x2))
+        return extent
+
+    def _cut(self, seen: _Seen, lanes: Lanes, new: Lanes, course: Course, stuck, h, ones) -> Array:
+        """The fraction of a step that ends at its first extremum of x1 or x2; 1 where there is none
+        inside, or where none is wanted."""
+        theta = jnp.ones_like(h)
+        asked = (seen.repeats.n > 0) & ~stuck & (h > NEAR)
+        ends = ((lanes.x2, lanes.a), (new.x2, new.a)), ((lanes.a, None), (new.a, None))
+        for order, ((start, _), (end, _)) in enumerate(ends):
+            values = [start, *(_rate_of(course, order, k / 4) for k in (1, 2, 3)), end]
+            for k in reversed(range(4)):
+                a, b = values[k], values[k + 1]
+                crosses = (a * b < 0) & asked
+                root = (k + a / jnp.where(crosses, a - b, 1.0)) / 4
+                inside = crosses & (root * h > NEAR * 0.5) & ((1 - root) * h > NEAR * 0.5)
+                inside = inside & (root > LEAST_CUT) & (root < 1 - LEAST_CUT)
+                theta = jnp.where(inside, jnp.minimum(theta, root), theta)
+        return materialise(theta, ones)
+
+    # --- strobes
+
+    def _strobed(self, seen: _Seen, lanes: Lanes, due: Array, tol: Array) -> _Seen:
+        """The memory behind a strobe, where one is due."""
+        now, known = seen.strobes, seen.repeats
+        extent, x1, x2 = seen.extent, lanes.x1, lanes.x2
+        is_top = x1 > extent.top[0]
+        top = tuple(jnp.where(is_top, a, b) for a, b in zip((x1, x2), extent.top, strict=True))
+        extent = replace(extent, top=top)
+        size = extent.high[0] - extent.low[0] + extent.high[1] - extent.low[1]
+        errors = ERRORS * tol * (1 + size)
+        close = SAME * size + errors
+        away = jnp.maximum(jnp.abs(x1 - known.x1), jnp.abs(x2 - known.x2))
+        since = now - known.at
+        back = away <= close
+        sooner = back & ((known.n == 0) | (since < known.n))
+        turn = (known.n > 0) & (since == known.n)
+        left = _way_left(away, known.moved)
+        shrinks = (away <= errors) | (away < known.moved)
+        again = turn & back & shrinks & ~sooner
+        lost = turn & ~again & ~sooner
+        expired = (known.n == 0) & ~back & (since >= known.patience) | (known.at < 0)
+        fresh = sooner | again | lost | expired
+        confirmed = jnp.where(again, known.confirmed + known.n, known.confirmed)
+        confirmed = jnp.where(sooner | lost | expired, 0, confirmed)
+        n = jnp.where(sooner, since, jnp.where(lost | expired, 0, known.n))
+        here = (known.n > 0) & ~turn
+        nearest = jnp.where(here, jnp.minimum(known.nearest, away), known.nearest)
+        settled = (away <= errors) | (left <= close)
+        # Errors hide how far it still goes where it comes nearer slowly, from both sides in turn.
+        still = jnp.where(away <= errors, 0.0, APART * left)
+        alone = (known.n == 1) | (nearest > still + APART_OF_ERRORS * errors)
+        found = again & settled & alone & (confirmed >= jnp.maximum(CONFIRMED, 2 * known.n))
+        repeats = _Repeats(
+            x1=jnp.where(fresh, x1, known.x1),
+            x2=jnp.where(fresh, x2, known.x2),
+            at=jnp.where(fresh, now, known.at),
+            patience=jnp.where(expired & (known.at >= 0), 2 * known.patience, known.patience),
+            n=n.astype(known.n.dtype),
+            confirmed=confirmed.astype(known.n.dtype),
+            moved=jnp.where(again | sooner, away, jnp.where(fresh, jnp.inf, known.moved)),
+            nearest=jnp.where(fresh, jnp.inf, nearest),
+        )
+        found = found & due if self.decides else due & False
+        empty = _Extent.none(lanes, len(extent.sticks))
+        empty = replace(empty, top=(x1, x2))
+        kept = choose(fresh & ~found, empty, extent)
+        return replace(
+            seen,
+            strobes=jnp.where(due, now + 1, now).astype(now.dtype),
+            repeats=choose(due, repeats, known),
+            extent=choose(due, kept, seen.extent),
+            kind=jnp.where(found, PERIODIC, seen.kind).astype(seen.kind.dtype),
+            periods=jnp.where(found, known.n, seen.periods).astype(seen.periods.dtype),
+            transient=jnp.where(found, lanes.t, seen.transient),
+        )
+
+    # --- events
+
+    def watch(self, osc, lanes, passage, ones, t1, tol):
+        seen: _Seen = lanes.memory
+        growth = seen.growth
+
+        def jumped():
+            return of_lanes(
+                _saltation,
+                osc,
+                passage.before,
+                passage.mode,
+                passage.number,
+                (passage.x1, passage.x2, passage.t),
+                (growth.d1, growth.d2),
+            )
+
+        fired = passage.fired & (lanes.run >= 0)
+        before = growth.d1, growth.d2
+        after = where_any(fired, jumped, before)
+        d1, d2 = (jnp.where(fired, a, b) for a, b in zip(after, before, strict=True))
+        growth = replace(growth, d1=d1, d2=d2, sticks=growth.sticks | lanes.mode.any_stuck)
+        growth = _counted(growth, lanes.t, t1)
+        resting = jnp.where(passage.captured, EQUILIBRIUM, seen.kind)
+        forever = lanes.status == Status.STUCK_FOREVER.value
+        kind = jnp.where(forever & (seen.kind == UNDECIDED), STUCK_FOR_EVER, resting)
+        new = (kind != UNDECIDED) & (seen.kind == UNDECIDED)
+        transient = jnp.where(new, lanes.t, seen.transient)
+        memory = replace(
+            seen, growth=growth, kind=kind.astype(seen.kind.dtype), transient=transient
+        )
+        done = lanes.done | (kind != UNDECIDED) if self.decides else lanes.done
+        return replace(lanes, memory=memory, done=done)
+
+    def exponent(self, lanes: Lanes) -> tuple[Array, Array]:
+        """The largest exponent per unit of time, and its standard error; NaN without blocks."""
+        growth = lanes.memory.growth
+        count = growth.blocks.astype(lanes.t.dtype)
+        safe = jnp.maximum(count, 2.0)  # one block has no spread
+        mean = growth.total / safe
+        spread = jnp.maximum(growth.squares / safe - mean * mean, 0.0) / (safe - 1)
+        known = count >= 2
+        return jnp.where(known, mean, jnp.nan), jnp.where(known, jnp.sqrt(spread), jnp.nan)
+
+
+class ForcedAttractor(Strobed):
+    """What a forced run leads to; it ends as soon as that is known.
+
+    - A periodic motion: its states at strobes repeat, all of them, over `CONFIRMED` strobes and two
+      of its periods; no state in between is the same; and what is left of the approach, by the rate
+      at which it shrinks, is below `SAME` of its size.
+    - Stuck for ever, or at rest on an edge that pushes back from both sides at all times.
+    - Where no repeat is found until the end of the run its largest exponent decides: it is chaotic
+      where that is more than three standard errors above zero, quasiperiodic where it is zero
+      within these, the mass never sticks and nothing seems to repeat, and else undecided, with the
+      status NOT_SETTLED.
+    """
+
+    variables: ClassVar[Mapping[str, Variable]] = {
+        "kind": Variable("what the run leads to", "int8", meanings=dict(enumerate(FORCED_KINDS))),
+        "periods": Variable("periods of the forcing until the motion repeats", "int32"),
+        "sticks": Variable("whether the attractor sticks to the belt", "bool", per_belt=True),
+        "period": Variable("period of the motion"),
+        "stick_duration": Variable("time stuck to the belt in one period", per_belt=True),
+        "x1_min": Variable("smallest displacement on the attractor", dimension="length"),
+        "x1_max": Variable("largest displacement on the attractor", dimension="length"),
+        "x2_min": Variable("smallest velocity on the attractor", dimension="velocity"),
+        "x2_max": Variable("largest velocity on the attractor", dimension="velocity"),
+        "x1_strobe": Variable("displacement at the strobe where it is largest", dimension="length"),
+        "x2_strobe": Variable("velocity at that strobe", dimension="velocity"),
+        "exponent": Variable("largest Lyapunov exponent, where no period was found"),
+        "exponent_error": Variable("its standard error"),
+        "transient": Variable("time at which the attractor was known"),
+        "n_events": Variable("number of events (of a periodic motion: in one period)", "int32"),
+    }
+
+    def finish(self, osc, lanes):
+        seen: _Seen = lanes.memory
+        extent, growth = seen.extent, seen.growth
+        exponent, error = self.exponent(lanes)
+        open_ = (seen.kind == UNDECIDED) & (lanes.status == Status.OK.value)
+        resolved = open_ & jnp.isfinite(exponent)
+        once = _period(osc, seen.turns)
+        doubt = jnp.maximum(DEVIATIONS * error, COMPUTED / once)
+        chaotic = resolved & (exponent > doubt)
+        even = resolved & (jnp.abs(exponent) <= doubt) & (doubt * once < RESOLVED) & ~growth.sticks
+        even = even & (seen.repeats.n == 0)
+        kind = jnp.where(chaotic, CHAOTIC, jnp.where(even, QUASIPERIODIC, seen.kind))
+        lost = open_ & (kind == UNDECIDED)
+        period = seen.periods.astype(lanes.t.dtype) * once
+        repeats, holds = kind == PERIODIC, kind == STUCK_FOR_EVER
+        rests = holds | (kind == EQUILIBRIUM)
+
+        def of_attractor(value, at_rest):
+            return jnp.where(repeats, value, jnp.where(rests, at_rest, jnp.nan))
+
+        sticks = [jnp.where(stuck & holds, jnp.inf, 0.0) for stuck in lanes.mode.stuck]
+        sticks = [of_attractor(one, rest) for one, rest in zip(extent.sticks, sticks, strict=True)]
+        return {
+            "kind": kind.astype(seen.kind.dtype),
+            "periods": jnp.where(repeats, seen.periods, 0),
+            "sticks": tuple(one > 0 for one in sticks),
+            "period": jnp.where(repeats, period, jnp.nan),
+            "stick_duration": tuple(sticks),
+            "x1_min": of_attractor(extent.low[0], lanes.x1),
+            "x1_max": of_attractor(extent.high[0], lanes.x1),
+            "x2_min": of_attractor(extent.low[1], lanes.x2),
+            "x2_max": of_attractor(extent.high[1], lanes.x2),
+            "x1_strobe": of_attractor(extent.top[0], lanes.x1),
+            "x2_strobe": of_attractor(extent.top[1], lanes.x2),
+            "exponent": jnp.where(open_, exponent, jnp.nan),
+            "exponent_error": jnp.where(open_, error, jnp.nan),
+            "transient": jnp.where(open_, jnp.nan, seen.transient),
+            "n_events": jnp.where(repeats, lanes.events - extent.events, lanes.events),
+            "status": jnp.where(lost, Status.NOT_SETTLED.value, lanes.status),
+        }
+
+
+class LargestExponent(Strobed):
+    """The largest Lyapunov exponent of a forced run, over its last three quarters."""
+
+    decides: ClassVar[bool] = False
+    variables: ClassVar[Mapping[str, Variable]] = {
+        "exponent": Variable("largest Lyapunov exponent per unit of time"),
+        "exponent_error": Variable("its standard error"),
+        "n_events": Variable("number of events", "int32"),
+    }
+
+    def finish(self, osc, lanes):
+        exponent, error = self.exponent(lanes)
+        good = lanes.status == Status.OK.value
+        return {
+            "exponent": jnp.where(good, exponent, jnp.nan),
+            "exponent_error": jnp.where(good, error, jnp.nan),
+            "n_events": lanes.events,
+            "status": lanes.status,
+        }
+
+
+def _period(osc: OwnOscillator, turns: Array) -> Array:
+    """Time between two strobes; a turn where there is no period."""
+    first = jnp.abs(frequencies(osc)[0])
+    return 2 * np.pi * jnp.maximum(turns, 1).astype(first.dtype) / first
+
+
+def _way_to_zero(value: Array, slope: Array, h: Array) -> Array:
+    """Time to where a value vanishes, 0 where that is farther than `NEAR`."""
+    way = -value / jnp.where(slope == 0, 1.0, slope)
+    return jnp.where((slope != 0) & (jnp.abs(way) <= NEAR) & (h > 0), way, 0.0)
+
+
+def _way_left(away: Array, moved: Array) -> Array:
+    """How far repeats still go, if each is nearer by the same factor; inf where they are not."""
+    shrinks = away < moved
+    left = away * away / jnp.where(shrinks, moved - away, 1.0)
+    left = jnp.where(jnp.isinf(moved), away, left)
+    return jnp.where(shrinks, left, jnp.inf)
+
+
+def _rate_of(course: Course, order: int, theta: float) -> Array:
+    """x2, or x2' for order 1, at a part of a step."""
+    total = jnp.zeros_like(course.duration)
+    for k in reversed(range(order + 1, len(course.x1))):
+        factor = k if order == 0 else k * (k - 1)
+        total = total * theta + factor * course.x1[k]
+    h = jnp.where(course.duration > 0, course.duration, 1.0)
+    return total / (h if order == 0 else h * h)
+
+
+# --- tangents -------------------------------------------------------------------------------------
+
+
+def _grown(osc, growth: _Growth, lanes: Lanes, course: Course, stuck, h, ones) -> _Growth:
+    """The tangent after a step of size h; the trace of the field is taken into the logarithm."""
+    mode, d1, d2, log = lanes.mode, growth.d1, growth.d2, growth.log
+    along = jnp.where(stuck, 0.0, h)
+    rates = []
+    for k in range(5):
+        now = at_time(osc, lanes.t + 0.25 * k * along)
+        x2 = _rate_of(course, 0, 0.25 * k) if k else lanes.x2
+
+        def field(x2, now=now):
+            return mode_acceleration(now, mode, lanes.x1, x2)
+
+        rates.append(materialise(jax.jvp(field, (x2,), (jnp.ones_like(x2),))[1], ones))
+    half = 0.5 * along
+    for start, middle, end in (rates[:3], rates[2:]):
+        mean, change = (start + 4 * middle + end) / 6, end - start
+        # Omega = half (0, 1; -1, mean) - half^2 / 12 change (0, 1; 1, 0), without half its trace.
+        twist = half * half * change / 12
+        p, q, r = -0.5 * half * mean, half - twist, -half - twist
+        square = p * p + q * r
+        even, odd = jnp.ones_like(square), jnp.ones_like(square)
+        for k in reversed(range(1, 9)):
+            even = 1 + square * even / ((2 * k - 1) * (2 * k))
+            odd = 1 + square * odd / (2 * k * (2 * k + 1))
+        d1, d2 = even * d1 + odd * (p * d1 + q * d2), even * d2 + odd * (r * d1 - p * d2)
+        log = log + 0.5 * half * mean
+    return replace(growth, d1=materialise(d1, ones), d2=materialise(d2, ones), log=log)
+
+
+def _counted(growth: _Growth, t: Array, t1: Array) -> _Growth:
+    """The tangent of size one, its growth in the logarithm, and the block ended that is over."""
+    size = jnp.hypot(growth.d1, growth.d2)
+    size = jnp.where((size > 0) & jnp.isfinite(size), size, 1.0)
+    log = growth.log + jnp.log(size)
+    first = growth.began + TRANSIENT * (t1 - growth.began)
+    length = (t1 - first) / BLOCKS
+    over = t >= first + (growth.blocks + 1).astype(t.dtype) * length - 1e-9 * length
+    elapsed = t - growth.since
+    counts = over & (growth.blocks >= 0) & (elapsed > 0)
+    rate = jnp.where(counts, log / jnp.where(counts, elapsed, 1.0), 0.0)
+    return replace(
+        growth,
+        d1=growth.d1 / size,
+        d2=growth.d2 / size,
+        log=jnp.where(over, 0.0, log),
+        since=jnp.where(over, t, growth.since),
+        blocks=jnp.where(over & (growth.blocks < BLOCKS), growth.blocks + 1, growth.blocks).astype(
+            growth.blocks.dtype
+        ),
+        total=growth.total + rate,
+        squares=growth.squares + rate * rate,
+        sticks=growth.sticks & ~(over & (growth.blocks < 0)),
+    )
+
+
+def _saltation(osc: OwnOscillator, before: Mode, after: Mode, number: Array, y, d):
+    """The tangent behind an event, of scalars: the guard of that number fired at the state y."""
+    entry, exit_ = field_at(osc, before, y), field_at(osc, after, y)
+
+    def guard(*y):
+        guards = guards_at(osc, before, y)
+        return jnp.sum(jnp.where(jnp.arange(guards.size) == number.astype(int), guards, 0.0))
+
+    _, moved = jax.jvp(guard, y, (*d, jnp.zeros_like(d[0])))
+    _, slope = jax.jvp(guard, y, entry)
+    late = -moved / jnp.where(slope == 0, 1.0, slope)
+    late = jnp.where(slope == 0, 0.0, late)
+    d1 = d[0] + (entry[0] - exit_[0]) * late
+    d2 = d[1] + (entry[1] - exit_[1]) * late
+    return d1, jnp.where(after.any_stuck, 0.0, d2)

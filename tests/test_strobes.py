@@ -1,0 +1,226 @@
+"""Labels, exponents, basins and integrals of forced sweeps, against `find_cycle`, `lyapunov`, runs
+of `simulate` and closed forms."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxbelt as jb
+from jaxbelt import Status
+
+
+def bernardo(frequency, amplitude=0.1):
+    """Of di Bernardo, Kowalczyk and Nordmark (2003): periodic, chaotic, and sticking motions."""
+    law = jb.Cubic(1.5, 1.5, 0.45)
+    forcing = jb.Harmonic(amplitude, frequency)
+    return jb.Oscillator(0.0, (jb.Belt(1.0, law, 1.0),), forcing=forcing)
+
+
+@pytest.fixture(scope="module")
+def labels():
+    frequencies = [1.68, 1.69, 1.7078, 1.715, 1.72, 1.8, 2.5]
+    return jb.sweep(
+        bernardo, {"frequency": frequencies}, y0=(0.5, 0.5), t1=8000.0, observe="attractor"
+    )
+
+
+def test_periodic_motions_are_those_of_find_cycle(labels):
+    kinds = jb.decoded(labels).kind.values
+    for i, frequency in enumerate(labels.frequency.values):
+        motion = jb.find_cycle(bernardo(frequency), (0.5, 0.5))
+        if motion.status != Status.OK:
+            assert kinds[i] == "chaotic" and labels.periods[i] == 0
+            assert np.isnan(labels.period[i]) and np.isnan(labels.x1_max[i])
+            continue
+        row = labels.isel(frequency=i)
+        assert kinds[i] == "periodic" and row.status == Status.OK
+        assert row.periods == motion.periods
+        np.testing.assert_allclose(row.period, motion.period, rtol=1e-12)
+        np.testing.assert_allclose(row.stick_duration, motion.stick_durations, atol=1e-5)
+        strobe = np.array([row.x1_strobe, row.x2_strobe])
+        starts = np.asarray(motion.starts)
+        np.testing.assert_allclose(strobe, starts[np.argmax(starts[:, 0])], atol=1e-5)
+        states = np.asarray(motion.sample(20_001))
+        found = [row.x1_min, row.x1_max, row.x2_min, row.x2_max]
+        expected = [states[:, 0].min(), states[:, 0].max(), states[:, 1].min(), states[:, 1].max()]
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_an_approach_from_two_sides_in_turn_has_the_period_of_its_end(labels):
+    """At 1.715 the largest multiplier is near -1: the motion repeats after four periods first."""
+    row = labels.sel(frequency=1.715)
+    assert row.periods == 2 and row.status == Status.OK
+
+
+def test_exponents_are_those_of_lyapunov_and_of_multipliers():
+    frequencies = [1.69, 1.7077, 1.72, 1.8]
+    found = jb.sweep(
+        bernardo, {"frequency": frequencies}, y0=(0.5, 0.5), t1=8000.0, observe="lyapunov"
+    )
+    for frequency, value, error in zip(
+        frequencies, found.exponent.values, found.exponent_error.values, strict=True
+    ):
+        osc = bernardo(frequency)
+        motion = jb.find_cycle(osc, (0.5, 0.5))
+        if motion.status == Status.OK:
+            expected = np.log(abs(motion.multipliers[0])) / motion.period
+            assert abs(value - expected) < 4 * error + 1e-4
+        else:
+            known = jb.lyapunov(osc, (0.5, 0.5), periods=400)
+            both = np.hypot(error, known.standard_errors[0])
+            assert abs(value - known.exponents[0]) < 4 * both
+            assert value > 3 * error
+
+
+def free(frequency, damping=0.0, amplitude=0.5, load=0.0):
+    forcing = jb.Harmonic(amplitude, frequency)
+    return jb.Oscillator(damping, (jb.Belt(0.3, jb.Coulomb(1.0, 1.0), load),), forcing=forcing)
+
+
+def test_a_torus_a_response_and_a_mass_that_is_held():
+    """Without friction and damping the motion is a sum of two frequencies; with damping it ends in
+    the linear response; within the capacity of a belt at rest nothing moves."""
+    osc = {"damping": [0.0, 0.2]}
+    found = jb.sweep(
+        lambda damping: free(np.sqrt(2), damping),
+        osc,
+        y0=(1.0, 0.0),
+        t1=4000.0,
+        observe="attractor",
+    )
+    assert list(jb.decoded(found).kind.values) == ["quasiperiodic", "periodic"]
+    assert abs(found.exponent[0]) < 1e-6
+    size = 0.5 / np.hypot(1 - 2, 0.2 * np.sqrt(2))
+    np.testing.assert_allclose(found.x1_max[1], size, rtol=1e-5)
+    np.testing.assert_allclose(found.x2_min[1], -np.sqrt(2) * size, rtol=1e-5)
+    assert found.periods[1] == 1
+
+    def held(amplitude):
+        belt = jb.Belt(0.0, jb.Coulomb(1.0, 1.0), 1.0)
+        return jb.Oscillator(0.1, (belt,), forcing=jb.Harmonic(amplitude, 0.8))
+
+    found = jb.sweep(held, {"amplitude": [0.5]}, y0=(0.2, 0.0), observe="attractor")
+    assert jb.decoded(found).kind[0] == "stuck" and bool(found.sticks[0, 0])
+    assert np.isinf(found.stick_duration[0, 0]) and found.x1_max[0] == 0.2
+
+
+def test_periods_are_those_that_all_frequencies_have_in_common():
+    def make(ratio):
+        forcing = (jb.Harmonic(0.5, 1.2), jb.Harmonic(0.3, 1.2 * ratio))
+        belt = jb.Belt(0.3, jb.Conti(1.0, 0.6, 10.0), 0.4)
+        return jb.Oscillator(0.3, (belt,), forcing=forcing)
+
+    found = jb.sweep(make, {"ratio": [2 / 3, 0.5, 3.0]}, y0=(0.5, 0.0), observe="attractor")
+    for i, ratio in enumerate(found.ratio.values):
+        motion = jb.find_cycle(make(ratio), (0.5, 0.0))
+        assert found.periods[i] == motion.periods
+        np.testing.assert_allclose(found.period[i], motion.period, rtol=1e-12)
+    # Frequencies with no period in common have no periodic motion.
+    found = jb.sweep(make, {"ratio": [np.sqrt(2)]}, y0=(0.5, 0.0), t1=3000.0, observe="attractor")
+    assert jb.decoded(found).kind[0] != "periodic" and found.periods[0] == 0
+
+
+@pytest.mark.parametrize("k", [-20, 20])
+def test_labels_do_not_depend_on_the_unit_of_length(labels, k):
+    unit = 2.0**k
+
+    def scaled(frequency):
+        law = jb.Cubic(1.5, 1.5 / unit, 0.45 / unit**3)
+        forcing = jb.Harmonic(0.1 * unit, frequency)
+        return jb.Oscillator(0.0, (jb.Belt(unit, law, unit),), forcing=forcing)
+
+    frequencies = labels.frequency.values
+    y0 = 0.5 * unit, 0.5 * unit
+    found = jb.sweep(scaled, {"frequency": frequencies}, y0=y0, t1=8000.0, observe="attractor")
+    for name in ("kind", "periods", "period", "exponent", "transient"):
+        np.testing.assert_array_equal(found[name], labels[name])
+    for name in ("x1_min", "x1_max", "x2_min", "x2_max", "x1_strobe", "x2_strobe"):
+        np.testing.assert_array_equal(found[name], unit * labels[name])
+
+
+def test_basins_of_two_attractors():
+    """At 1.68 a sticking motion of two periods and chaos: each start as a run of its own says."""
+    osc = bernardo(1.68)
+    x1, x2 = np.linspace(-1, 3, 7), np.linspace(-1.2, 1.2, 5)
+    found = jb.basins(osc, x1=x1, x2=x2, t1=3000.0)
+    assert found.attractors == ("2-periodic motion that sticks to belt 0", "chaotic motion")
+    assert found.boundary is None and found.cycles[0].periods == 2
+    for i, j in ((0, 4), (3, 2), (5, 1), (6, 0)):
+        motion = jb.find_cycle(osc, (x1[i], x2[j]))
+        is_periodic = int(found.label[i, j]) == 0
+        assert (motion.status == Status.OK) == is_periodic
+    table = found.table()
+    assert list(table.attractor) == [*found.attractors, "undecided"]
+    np.testing.assert_allclose(table.multiplier_0[0], found.cycles[0].multipliers[0].real)
+    found.plot()
+    box = (-1, 3), (-1.2, 1.2)
+    shares = jb.basin_stability(osc, box=box, n=512, key=jax.random.key(0), t1=3000.0)
+    assert 0.8 < shares.fractions["periodic"] < 0.95 and shares.fractions["stuck"] == 0
+    with pytest.raises(ValueError, match="finite_time_stability"):
+        found.finite_time_stability(10.0, 0.1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Energy:
+    """Work of friction and of damping, and the mean square of x1."""
+
+    at = (jb.AtEvents(),)
+
+    def init(self, osc, x1, x2):
+        return jnp.zeros(())
+
+    def rates(self, osc, motion):
+        return jnp.sum(motion.forces) * motion.x2, motion.x2**2, motion.a * jnp.cos(motion.t)
+
+    def update(self, state, event):
+        return event.integrals[0]
+
+    def finish(self, state, end):
+        return dict(zip(("friction", "square", "cosine"), end.integrals, strict=True))
+
+
+@pytest.mark.parametrize("velocity", [0.3, jb.Oscillating(0.3, 0.1, 1.2)])
+@pytest.mark.parametrize("end", [9.0, 25.24, 26.0, 30.0])
+def test_integrals_keep_the_balance_of_energy(velocity, end):
+    """With a constant force beside the belts the work of friction and damping is known from the
+    states at both ends; the cosine of the time enters by an integral by parts."""
+    law = jb.Conti(1.0, 0.6, 10.0)
+    load = jb.Oscillating(1.0, 0.3, 0.6)
+
+    def make(damping):
+        belts = jb.Belt(velocity, law, load), jb.Belt(0.1, jb.Coulomb(0.5, 0.4), 0.3, upper=0.9)
+        return jb.Oscillator(damping, belts)
+
+    run = jb.sweep(
+        make, {"damping": [0.1]}, y0=(0.5, 0.1), t1=end, observe=Energy(), rtol=1e-10, atol=1e-10
+    )
+    last = jb.simulate(make(0.1), (0.5, 0.1), end, rtol=1e-11, atol=1e-11).ys[-1]
+    gained = 0.5 * float(jnp.sum(last**2)) - 0.5 * (0.5**2 + 0.1**2)
+    np.testing.assert_allclose(run.friction[0] - 0.1 * run.square[0], gained, atol=3e-8)
+
+
+@pytest.mark.parametrize(
+    "observe, t1, message",
+    [
+        ("lyapunov", 100.0, "observe must be for oscillators that are forced"),
+        ("exponent", 100.0, "observe must be"),
+    ],
+)
+def test_what_is_for_forced_oscillators_only(observe, t1, message):
+    def make(velocity):
+        return jb.Oscillator(0.1, (jb.Belt(velocity, jb.Coulomb(1.0, 1.0), 1.0),))
+
+    with pytest.raises(ValueError, match=message):
+        jb.sweep(make, {"velocity": [0.1]}, t1=t1, observe=observe)
+
+
+def test_an_exponent_needs_an_end_and_labels_no_audit():
+    with pytest.raises(ValueError, match="t1 must be given"):
+        jb.sweep(bernardo, {"frequency": [1.7]}, observe="lyapunov")
+    with pytest.raises(ValueError, match="audit must be 0"):
+        jb.sweep(bernardo, {"frequency": [1.7]}, observe="attractor", audit=0.5)
+    with pytest.raises(ValueError, match="t0 must be"):
+        jb.basins(jb.presets.class_b(0.3, 0.35), x1=[0.0], x2=[0.0], t0=1.0)
