@@ -443,7 +443,14 @@ def extrema_along(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
     return least * np.sum(_SIDES, axis=1)
 
 
-def _least(osc: Oscillator, codes: Array, states: Array, weight: Array, least: Array, at: Array):
+def _least(
+    osc: Oscillator,
+    codes: Array,
+    states: Array,
+    weight: Array | np.ndarray,
+    least: Array,
+    at: Array,
+):
     """The least value of weight (x1, x2) along an arc, from the quintics' least values and their
     places between the ends of steps, [steps] each."""
     mode, step = mode_of(codes), jnp.argmin(least)
