@@ -463,7 +463,7 @@ def _least(
         return jnp.where(mode.any_stuck, held, slipped)
 
     def function(y):
-        return weight @ jnp.stack(y[:2])
+        return jnp.dot(weight, jnp.stack(y[:2]))
 
     for _ in range(EXTREMUM_STEPS):
         s = lax.stop_gradient(s)
