@@ -62,7 +62,12 @@ UNITS_OF_FIELDS: dict[str, tuple[str, Callable[[Units], Any]]] = {
     "load": ("N", lambda units: units.force),
     **dict.fromkeys(("lower", "upper"), ("m", lambda units: units.length)),
     "frequency": ("rad s-1", lambda units: 1 / units.time),
-    "phase": ("rad", lambda units: jnp.ones_like(units.time)),
+    "phase": ("rad", lambda units: jnp.ones(())),
+}
+#: Likewise of the amplitude of a force; numbers of a user's force have units that its author knows.
+UNITS_OF_FORCES = {
+    **dict.fromkeys((Harmonic, ConstantForce), ("N", lambda units: units.force)),
+    BaseMotion: ("m", lambda units: units.length),
 }
 #: Relative accuracy to which a number of a friction law has to follow a power of the unit of speed.
 POWER_ROUNDING = 1e-12
@@ -115,8 +120,8 @@ def in_si(
       limit of a jump of the force from the left is no sample); `t_event`, `x1_event`, `x2_event`,
       `event_kind` and `event_belt`.
     - a cycle: `period`, `stick_duration` of each belt, `x1_min`, `x1_max`, `x2_min`, `x2_max`,
-      `amplitude`, and `energy`, which friction and dashpot turn into heat in one period (not of a
-      forced motion).
+      `amplitude`, and `energy`, which friction and dashpot turn into heat in one period.
+    - a forced motion: the same without `energy`, `x1` and `x2` at the phase 0, and `periods`.
     - a portrait: over `row`, the columns of its `table()`, `rate` in 1/s.
     - a shock: `x1` and `x2` of its start, `shock_x1`, `shock_x2`, and `distance`, in m/s where it
       changes the velocity alone. A distance that combines both stays dimensionless.
@@ -129,9 +134,9 @@ def in_si(
       datum minus motion.
     - a diagram, or fractions: over `row`, the columns of its `table()`; a special point is a row
       with the branch -1. `value`, of the parameter, is in m/s for the velocity of a belt, in N for
-      a load (the normal force), in m for a contact edge, in N s/m for the damping, in N (of a
-      support in m), rad/s or rad for the forcing; the argument of a function stays as the function
-      takes it.
+      a load (the normal force), in m for a contact edge, in N s/m for the damping, in rad/s for the
+      frequency of a force, in N for its amplitude (in m for that of a support); the argument of a
+      function stays as the function takes it.
     - a dataset: its own variables, with derivatives by starts and parameters where the units are
       the same in all runs. Results of a user's observable stay dimensionless, and so does the
       attribute `start`; the words for `label` of basins say in m where the mass rests.
@@ -143,8 +148,8 @@ def in_si(
     instead.
 
     Args:
-        result: A result for the machine's oscillator: a `Trajectory`, a `Cycle`, a
-            `PeriodicMotion`, a `Portrait`, a `FatalShock`, `Basins`, `BasinStability`, a `Fit`, a
+        result: A result for the machine's oscillator: a `Trajectory`, a `Cycle`, a `Portrait`, a
+            `PeriodicMotion`, a `FatalShock`, `Basins`, `BasinStability`, a `Fit`, a
             `BifurcationDiagram`, an `OrbitDiagram`, `BasinFractions`, or the dataset of a sweep.
         machine: The `Machine`. Where a sweep has axes other than starts, or a function was given in
             place of an oscillator: a function of these that returns the machine, as its units may
@@ -361,22 +366,28 @@ def _cycle(cycle: Cycle | PeriodicMotion, machine: Machine | Units) -> "xarray.D
     units = units_of(machine)
     require(cycle.unknowns.ndim == 2, "result", "one cycle, not a batch", repr(cycle))
     check_machine(cycle, machine)
+    x1_min, x1_max = cycle.x1_min, cycle.x1_max
     variables = {
         "period": ((), cycle.period, "period"),
         "stick_duration": ("belt", cycle.stick_durations, "time stuck to the belt in one loop"),
-        "x1_min": ((), cycle.x1_min, "smallest displacement"),
-        "x1_max": ((), cycle.x1_max, "largest displacement"),
+        "x1_min": ((), x1_min, "smallest displacement"),
+        "x1_max": ((), x1_max, "largest displacement"),
         "x2_min": ((), cycle.x2_min, "smallest velocity"),
         "x2_max": ((), cycle.x2_max, "largest velocity"),
-        "amplitude": ((), (cycle.x1_max - cycle.x1_min) / 2, "half of the span of displacement"),
+        "amplitude": ((), (x1_max - x1_min) / 2, "half of the span of displacement"),
     }
-    if isinstance(cycle, Cycle):
-        variables["energy"] = ((), energy_dissipated(cycle), "energy dissipated in one period")
+    attrs: dict[str, Any] = {"status": Status(int(cycle.status)).name}
+    if isinstance(cycle, PeriodicMotion):
+        attrs["periods"] = cycle.periods
+        for i, word in enumerate(("displacement", "velocity")):
+            variables[f"x{i + 1}"] = ((), cycle.start[i], f"{word} at the phase 0")
+    else:
+        energy = energy_dissipated(cycle)
+        variables["energy"] = ((), energy, "energy dissipated in one period")
     found = {
         name: _variable(dims, values, name, units, long_name)
         for name, (dims, values, long_name) in variables.items()
     }
-    attrs = {"status": Status(int(cycle.status)).name}
     return xarray.Dataset(found, {"belt": np.arange(len(cycle.oscillator.belts))}, attrs)
 
 
@@ -438,26 +449,24 @@ def _unit_of(name: str, osc: Oscillator, units: Units) -> tuple[str, float]:
     for path in name.split(" = "):
         if ".friction." in path:
             found.add(_unit_in_law(path, osc, units))
-            continue
-        field = _field_of(path, osc)
-        symbol, size = UNITS_OF_FIELDS[field] if field else ("", lambda units: 1.0)
-        found.add((symbol, float(size(units))))
+        else:
+            symbol, size = _unit_of_field(path, osc)
+            found.add((symbol, float(size(units))))
     require(len(found) == 1, "result", "of tied parameters with one unit", name)
     return found.pop()
 
 
-def _field_of(path: str, osc: Oscillator) -> str:
-    """The field in `UNITS_OF_FIELDS` that a number is measured like; "" for one of a user's force,
-    whose unit only its author knows."""
+def _unit_of_field(path: str, osc: Oscillator) -> tuple[str, Callable[[Units], Any]]:
+    """As `UNITS_OF_FIELDS`, for a number that is in no friction law."""
     owner, _, field = path.rpartition(".")
-    if not path.startswith("forcing["):
-        return owner.rpartition(".")[2] if field in ("mean", "amplitude") else field
-    force = osc.forcing[int(path.removeprefix("forcing[").partition("]")[0])]
-    if not isinstance(force, Harmonic | BaseMotion | ConstantForce):
-        return ""
-    if field == "amplitude":
-        return "lower" if isinstance(force, BaseMotion) else "load"
-    return field
+    if owner.startswith("forcing["):
+        force = osc.forcing[int(owner.removeprefix("forcing[").partition("]")[0])]
+        known = UNITS_OF_FORCES.get(type(force))
+        if known is None:
+            return "", lambda units: 1.0
+        return known if field == "amplitude" else UNITS_OF_FIELDS[field]
+    # The mean and the amplitude of a wave are what the field is that oscillates.
+    return UNITS_OF_FIELDS[owner.rpartition(".")[2] if field in ("mean", "amplitude") else field]
 
 
 def _unit_in_law(path: str, osc: Oscillator, units: Units) -> tuple[str, float]:
@@ -541,7 +550,7 @@ def units_along(
     name, belts = result.name, len(osc.belts)
     belt = name.removeprefix("belts[").partition("]")[0] if name.startswith("belts[") else "0"
     require(int(belt) < belts, "machine", f"of a belt {belt}, of which result is", f"{belts} belts")
-    known = "the velocity, load, edges or law of a belt, the damping or the forcing"
+    known = "the velocity, load, edges or law of a belt, a force, or the damping"
     require(name != "omega", "result", f"along {known}", "one along omega, 1 in every machine")
     return units, _unit_of(name, osc, units)
 

@@ -15,6 +15,7 @@ from laws import Lorentz
 import jaxbelt as jb
 from jaxbelt.bifurcations.diagrams import Branch
 from jaxbelt.model.parameters import names_of
+from jaxbelt.si import _unit_of
 
 MASS, STIFFNESS, DAMPING = 0.5, 2000.0, 1.0
 
@@ -608,6 +609,65 @@ def test_results_along_a_parameter_in_si():
         (ours,) = {tuple(jb.in_si(one, m).value.values) for one in along(name)[:1]}
         assert ours[0] == pytest.approx(0.5 * size)
     plt.close("all")
+
+
+def shaken(frequency):
+    """The first belt at rest, alone, and a force of 12 N."""
+    sole = jb.PhysicalBelt(0.0, jb.Coulomb(0.4, 0.4), 10.0)
+    force = jb.Harmonic(12.0, frequency)
+    return jb.Machine(MASS, STIFFNESS, DAMPING, (sole,), forcing=force)
+
+
+def test_a_forced_motion_in_si():
+    m = shaken(60.0)
+    motion = jb.find_cycle(m.oscillator, m.start(0.0, 0.0))
+    ours, length = jb.in_si(motion, m), 10.0 / STIFFNESS
+    assert float(ours.period) == pytest.approx(2 * np.pi / 60.0, rel=1e-14)
+    assert ours.attrs == {"status": "OK", "periods": 1} and "energy" not in ours
+    assert float(ours.amplitude) == pytest.approx(float(motion.x1_max) * length, rel=1e-9)
+    assert ours.amplitude.units == ours.x1.units == "m" and ours.x2.units == "m s-1"
+    with pytest.raises(ValueError, match=r"oscillator has forcing\[0\].frequency"):
+        jb.in_si(motion, shaken(61.0))
+
+
+@pytest.mark.slow
+def test_a_diagram_of_a_forced_machine_in_si():
+    m, time = shaken(60.0), np.sqrt(MASS / STIFFNESS)
+    motion = jb.find_cycle(m.oscillator, m.start(0.0, 0.0))
+    by_argument = jb.bifurcation_diagram(
+        lambda frequency: shaken(frequency).oscillator, span=(58.0, 62.0), start=motion
+    )
+    span = 58.0 * time, 62.0 * time
+    by_leaf = jb.bifurcation_diagram(
+        m.oscillator, lambda o: o.forcing[0].frequency, span, start=motion
+    )
+    one, other = jb.in_si(by_argument, shaken), jb.in_si(by_leaf, m)
+    assert other.value.units == "rad s-1" and one.x1_max.units == "m"
+    for ours in (one, other):
+        assert ours.value.values[[0, -1]] == pytest.approx([58.0, 62.0], rel=1e-12)
+    ax = jb.plot_in_si(by_leaf, m, quantity="amplitude")
+    assert ax.get_xlabel() == r"frequency of forcing $\Omega$ (rad/s)"
+    assert ax.get_xlim() == pytest.approx((58.0, 62.0))
+    plt.close("all")
+
+
+def test_units_of_the_numbers_of_forces():
+    waves = jb.Harmonic(12.0, 60.0), jb.BaseMotion(0.001, 60.0)
+    belt = jb.PhysicalBelt(jb.Oscillating(0.1, 0.01, 60.0), jb.Coulomb(0.4, 0.4), 10.0)
+    m = jb.Machine(MASS, STIFFNESS, DAMPING, (belt,), forcing=waves)
+    osc, names = m.oscillator, names_of(m.oscillator)
+    leaves = dict(zip(names, jax.tree.leaves(osc), strict=True))
+    for name, size, symbol in (
+        ("forcing[0].amplitude", 12.0, "N"),
+        ("forcing[0].frequency", 60.0, "rad s-1"),
+        ("forcing[0].phase", 0.0, "rad"),
+        ("forcing[1].amplitude", 0.001, "m"),
+        ("belts[0].velocity.mean", 0.1, "m s-1"),
+        ("belts[0].velocity.amplitude", 0.01, "m s-1"),
+        ("belts[0].velocity.frequency", 60.0, "rad s-1"),
+    ):
+        unit, one = _unit_of(name, osc, m.units)
+        assert unit == symbol and float(leaves[name]) * one == pytest.approx(size, rel=1e-14)
 
 
 def doubled(cycle):

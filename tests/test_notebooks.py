@@ -9,7 +9,7 @@ import pytest
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 #: What the others show takes minutes, and has tests of its own.
-BY_DAY = ("01_first_steps", "02_sweeps", "06_atlas")
+BY_DAY = ("01_first_steps", "02_sweeps", "06_atlas", "08_response")
 
 
 @pytest.mark.filterwarnings("ignore:FigureCanvasAgg is non-interactive:UserWarning")

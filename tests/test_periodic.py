@@ -7,6 +7,7 @@ independent engines computed.
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from scipy.optimize import brentq
@@ -95,6 +96,45 @@ def test_samples_begin_and_end_at_the_start(sticking):
     assert states[0] == pytest.approx(np.asarray(sticking.start), abs=1e-14)
     assert states[-1] == pytest.approx(states[0], abs=1e-10)
     assert states[50] == pytest.approx(np.asarray(sticking.starts[1]), abs=1e-10)
+
+
+def test_extrema_are_those_of_samples(smooth, sticking):
+    # A belt that turns back while the mass sticks to it: x1 is largest inside of a stick phase.
+    belt = jb.Belt(jb.Oscillating(0.0, 0.5, 1.0), jb.Coulomb(1.0, 1.0))
+    carrier = jb.Oscillator(0.1, (belt,), forcing=jb.Harmonic(1.15, 1.0))
+    carried = jb.find_cycle(carrier, (0.0, 0.0))
+    assert float(carried.stick_durations[0]) > 1.0
+    for motion in (smooth, sticking, carried):
+        found = [motion.x1_min, motion.x1_max, motion.x2_min, motion.x2_max]
+        states = np.asarray(motion.sample(40_001))
+        seen = np.array([[x.min(), x.max()] for x in states.T]).ravel()
+        # Between samples, 1e-3 apart at most, there is no more than 1e-6.
+        beyond = (np.array(found) - seen) * [-1, 1, -1, 1]
+        assert np.all((beyond > -1e-12) & (beyond < 1e-6))
+        row = motion.table().iloc[0]
+        assert row.amplitude == 0.5 * (row.x1_max - row.x1_min) == float(jb.amplitude(motion))
+
+
+def test_functionals_of_a_forced_motion(sticking):
+    stuck = float(sticking.stick_durations[0])
+    assert float(jb.period(sticking)) == pytest.approx(4 * np.pi / 1.68, rel=1e-15)
+    assert float(jb.stick_duration(sticking, 0)) == float(jb.stick_duration(sticking)) == stuck
+    assert float(jb.slip_duration(sticking, 0)) == pytest.approx(
+        float(jb.slip_duration(sticking)), abs=1e-12
+    )
+    assert float(jb.stick_fraction(sticking)) == pytest.approx(stuck * 1.68 / (4 * np.pi))
+    assert float(jb.peak(sticking, "x2")) == pytest.approx(1.0, abs=1e-14)
+    for functional in (jb.energy_fed, lambda motion: jb.gap(motion, 0)):
+        # The types are checked before, where tests check them.
+        with pytest.raises((ValueError, TypeError), match="PeriodicMotion"):
+            functional(sticking)
+
+
+def test_extrema_of_a_batch(sticking):
+    values = jnp.array([1.678, 1.68])
+    motions = jax.vmap(lambda frequency: sticking.at(bkn(frequency)))(values)
+    assert motions.x1_max.shape == (2,)
+    assert motions.x1_max[1] == pytest.approx(float(sticking.x1_max), abs=1e-11)
 
 
 def test_derivatives_are_those_of_the_engine(sticking):
@@ -232,14 +272,14 @@ def test_the_torus_point_is_where_the_area_is_kept():
 ZETA, FRICTION, FORCE = 0.05, 0.4, 1.0
 
 
-def den_hartog(frequency):
+def den_hartog(frequency, friction=FRICTION):
     return jb.Oscillator(
-        *(ZETA, (jb.Belt(0.0, jb.Coulomb(FRICTION, FRICTION)),)),
+        *(ZETA, (jb.Belt(0.0, jb.Coulomb(friction, friction)),)),
         forcing=jb.Harmonic(FORCE, frequency),
     )
 
 
-def closed_form(frequency):
+def closed_form(frequency, friction=FRICTION):
     """The motion without stops from its largest displacement X on, in closed form: X, the phase of
     the force there, and (x1, x2) at a time less than half a period later."""
     root = np.sqrt(1 - ZETA**2 / 4)
@@ -253,7 +293,7 @@ def closed_form(frequency):
         [e * c, e * s, 1.0, 0.0],
         [e * (-half * c - root * s), e * (root * c - half * s), 0.0, -frequency],
     ]
-    A, B, rest, Q = np.linalg.solve(matrix, [-FRICTION, 0.0, -FRICTION, 0.0])
+    A, B, rest, Q = np.linalg.solve(matrix, [-friction, 0.0, -friction, 0.0])
     response = 1 / complex(1 - frequency**2, ZETA * frequency)
     P = np.sqrt((FORCE * abs(response)) ** 2 - Q**2)
     phase = np.angle((P - 1j * Q) / response)
@@ -264,7 +304,7 @@ def closed_form(frequency):
         turned = -A * np.sin(angle) + B * np.cos(angle)
         wave = P * np.cos(frequency * t) + Q * np.sin(frequency * t)
         slope = frequency * (-P * np.sin(frequency * t) + Q * np.cos(frequency * t))
-        x1, x2 = FRICTION + fades * own + wave, fades * (root * turned - half * own) + slope
+        x1, x2 = friction + fades * own + wave, fades * (root * turned - half * own) + slope
         return np.array([x1, x2])
 
     return rest + P, phase, state
@@ -293,6 +333,54 @@ def test_den_hartog_without_stops():
     assert motion.periods == 1
     assert motion.start == pytest.approx(start_of(0.6), abs=1e-10)
     assert [kind.name for kind, _ in motion.signature] == ["CROSS", "CROSS"]
+
+
+def test_the_amplitude_and_its_derivatives_are_those_of_the_closed_form():
+    def height(frequency, friction):
+        return jb.amplitude(jb.find_cycle(den_hartog(frequency, friction), (0.0, 0.0)))
+
+    value, slopes = jax.value_and_grad(height, argnums=(0, 1))(0.6, FRICTION)
+    assert float(value) == pytest.approx(closed_form(0.6)[0], abs=1e-11)
+    h = 1e-4  # of order four: 1e-15 beside 1e-12 of rounding
+    for slope, step in zip(slopes, np.eye(2) * h, strict=True):
+        near, far = (
+            (closed_form(*(at + n * step))[0] - closed_form(*(at - n * step))[0]) / (2 * n * h)
+            for at in [np.array([0.6, FRICTION])]
+            for n in (1, 2)
+        )
+        assert float(slope) == pytest.approx((4 * near - far) / 3, abs=1e-9)
+
+
+def test_a_guess_beside_a_stick_gives_no_stick_phase_of_no_duration():
+    stopping = jb.find_cycle(den_hartog(0.47), (0.0, 0.0))
+    assert len(stopping.signature) == 4 and stopping.start[1] == 0.0
+    guess = np.asarray(stopping.start) + np.array([0.0, -1e-3])
+    again = jb.periodic(den_hartog(0.47), guess)
+    assert again.start == pytest.approx(np.asarray(stopping.start), abs=1e-10)
+    assert again.signature == stopping.signature
+
+
+@pytest.mark.slow
+def test_a_branch_goes_on_where_stops_begin_and_where_one_passes_the_phase_0():
+    """Two stops begin at the limit; at 0.4711 one of them begins at the phase 0."""
+    start = jb.find_cycle(den_hartog(0.58), (0.0, 0.0))
+    diagram = jb.bifurcation_diagram(den_hartog, span=(0.46, 0.6), start=start)
+    (point,), (branch,) = diagram.points, diagram.branches
+    assert point.kind == "CrossingSliding"
+    assert float(point.value) == pytest.approx(limit_without_stops(), abs=1e-10)
+    assert branch.values[[0, -1]] == pytest.approx([0.46, 0.6], abs=1e-12)
+    assert np.all(np.diff(branch.values) > 0)
+    slips = branch.values > limit_without_stops()
+    assert np.array_equal(slips, ~(branch.stick_durations[:, 0] > 0))
+    assert np.all(branch.evaluated(jb.stick_fraction)[~slips] > 0)
+    exact = [closed_form(one)[0] for one in branch.values[slips]]
+    # Rows of a branch are good to what its corrector leaves.
+    assert branch.amplitude[slips] == pytest.approx(exact, abs=1e-8)
+    stopping = jb.find_cycle(den_hartog(0.46), (0.0, 0.0))
+    assert branch.amplitude[0] == pytest.approx(float(jb.amplitude(stopping)), abs=1e-8)
+    ax = diagram.plot(quantity="amplitude")
+    assert ax.get_xlim() == (0.46, 0.6) and ax.get_xlabel() == r"frequency of forcing $\Omega$"
+    plt.close("all")
 
 
 @pytest.mark.slow

@@ -819,8 +819,8 @@ def test_no_samples_in_a_batch():
     assert np.all(np.any(np.nan_to_num(slopes) != 0, axis=1))
 
 
-#: Friction falls within 3e-5 to 1e-4 of the own unit: start, damping, (velocity, load) of belts, and
-#: by the engine of the campaigns the number of events until 50 and the state there.
+#: Friction falls within 3e-5 to 1e-4 of the own unit: start, damping, (velocity, load) of belts; by
+#: the engine of the campaigns the number of events until 50 and the state there.
 THIN = [
     ((2.487, 0.475), 0.098, [(0.2328, 0.446)], 5, (0.2534408535373042, 0.04556610074149681)),
     ((-1.35, 0.0), 0.05, [(0.35, 1.0)], 15, (0.25506473732934754, 0.32444510417110334)),

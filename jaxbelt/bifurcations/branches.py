@@ -145,6 +145,10 @@ class MotionLeg(NamedTuple):
         value = float(self.line.length * u[-1])
         return MotionRow(value, _motion_of_row(self.line.at(value), self.chain, jnp.asarray(z)))
 
+    def start(self, u: np.ndarray) -> np.ndarray:
+        """The state at the phase 0, also of what is no motion."""
+        return (u[:-1] / np.asarray(self.weights))[:2]
+
 
 def _linearized_motion(
     u: Array, args: tuple[Family, TimedChain, Array, Array]
@@ -169,12 +173,9 @@ def _side_of_point(
     rows, points = [row], []
     while len(rows) < MOST_MOTIONS:
         note_progress(f"{len(rows)} motions on one side")
-        ahead, found, direction = _branch_leg(line, rows[-1], sign)
+        ahead, found, further = _branch_leg(line, rows[-1], sign)
         rows += ahead
         points += found
-        if direction is None:
-            break
-        further = _beyond_point(line, rows[-1], found[-1], direction)
         if further is None:
             break
         new, sign = further
@@ -184,9 +185,9 @@ def _side_of_point(
 
 def _branch_leg(
     line: ForcedLine, row: MotionRow, sign: float
-) -> tuple[list[MotionRow], list[BifurcationPoint], float | None]:
-    """The motions after a row with its signature, the points on the way, and the sense in which the
-    parameter goes where the signature ends in the last one of these; None where there is none."""
+) -> tuple[list[MotionRow], list[BifurcationPoint], tuple[MotionRow, float] | None]:
+    """The motions after a row with its signature, the points on the way, and, where the signature
+    ends, the first motion with another one, and the sense in which the parameter goes from it."""
     leg, u = MotionLeg.of(line, row)
     axis = np.zeros_like(u)
     axis[-1] = 1.0
@@ -207,9 +208,13 @@ def _branch_leg(
             rows += _at_end(leg, u, solved.u, end, line)
             return rows, points, None
         if int(new.motion.status) != Status.OK:
-            point = _border(line, last, new, solved.u[-1] - u[-1])
+            start, direction = leg.start(solved.u), float(np.sign(tangent[-1]))
+            turned = _past_phase(line, last, new.value, start)
+            if turned is not None:
+                return rows, points, (turned, float(np.sign(new.value - last.value)))
+            point = _border(line, last, new.value, start)
             if point is not None:
-                return rows, [*points, point], float(np.sign(tangent[-1]))
+                return rows, [*points, point], _beyond_point(line, last, point, direction)
             step *= 0.5
             continue
         points += list(_points_between(line, last, new))
@@ -252,7 +257,8 @@ def _points_between(
             continue
         nearer = min((one, other), key=lambda row: abs(_tests(row.motion)[kind]))
         found = _points(line, kind(), nearer)
-        fine = [point for point in found if _rows_are_beside(line, point, one, other)]
+        start = np.asarray(other.motion.start)
+        fine = [p for p in found if _is_between(line, p, one, other.value, start)]
         yield from fine[:1]
 
 
@@ -264,26 +270,44 @@ def _points(
     return [replace(p, condition=condition) for p in found if int(p.status) == Status.OK]
 
 
-def _rows_are_beside(
-    line: ForcedLine, point: BifurcationPoint, one: MotionRow, other: MotionRow
+def _is_between(
+    line: ForcedLine, point: BifurcationPoint, one: MotionRow, value: float, start: np.ndarray
 ) -> bool:
-    """Whether a point is as near to two motions as they are to each other, about."""
-    starts = np.asarray(one.motion.start), np.asarray(other.motion.start)
-    apart = np.max(np.abs(starts[0] - starts[1])) + 1e-6
-    reach = 2 * abs(other.value - one.value) + 2 * LONGEST_STEP_OF_BRANCH * line.length
-    away = np.max(np.abs(np.asarray(point.cycle.start) - starts[0]))
+    """Whether a point is as near to a motion as another value, and another state at the phase 0,
+    are to it, about."""
+    apart = np.max(np.abs(np.asarray(one.motion.start) - start)) + 1e-6
+    reach = 2 * abs(value - one.value) + 2 * LONGEST_STEP_OF_BRANCH * line.length
+    away = np.max(np.abs(np.asarray(point.cycle.start) - np.asarray(one.motion.start)))
     return abs(float(point.value) - one.value) <= reach and bool(away <= 5 * apart + 0.01)
 
 
+def _past_phase(
+    line: ForcedLine, last: MotionRow, value: float, start: np.ndarray
+) -> MotionRow | None:
+    """The motion at a value near to a state at the phase 0, if it has the events of the last one in
+    their order: then one of these has passed the phase 0, where chains begin."""
+    motion = periodic_from(line.at(value), start, last.motion.periods, line.turns)
+    if int(motion.status) != Status.OK or motion.periods != last.motion.periods:
+        return None
+    if np.array_equal(motion.chain.codes[0], last.motion.chain.codes[0]):
+        return None
+    events, before = motion.signature, last.motion.signature
+    turns = (before[k:] + before[:k] for k in range(max(1, len(before))))
+    apart = np.max(np.abs(start - np.asarray(last.motion.start)))
+    away = np.max(np.abs(np.asarray(motion.start) - start))
+    return MotionRow(value, motion) if events in turns and away <= apart else None
+
+
 def _border(
-    line: ForcedLine, last: MotionRow, new: MotionRow, change: float
+    line: ForcedLine, last: MotionRow, value: float, start: np.ndarray
 ) -> BifurcationPoint | None:
-    """The point in which the signature of the last motion ends before the new one, None where the
-    conditions find none so near."""
+    """The point in which the signature of the last motion ends on the way to another value, and to
+    another state at the phase 0, None where the conditions find none so near."""
     belts = range(last.motion.chain.codes.shape[-1])
     kinds: list[Any] = [GrazingSliding, CrossingSliding, SwitchingSliding, AddingSliding]
     found = [p for k in kinds for belt in belts for p in _points(line, k(belt), last)]
-    near = [p for p in found if _rows_are_beside(line, p, last, new)]
+    near = [p for p in found if _is_between(line, p, last, value, start)]
+    change = value - last.value
     ahead = [p for p in near if (float(p.value) - last.value) * change >= -1e-9 * line.length]
     return min(ahead, key=lambda p: abs(float(p.value) - last.value), default=None)
 

@@ -143,7 +143,7 @@ class BifurcationDiagram(eqx.Module):
             touches a contact edge.
         branches: Branches of equilibria, then of cycles.
         regions: (first, last, name) for every stretch between points of `scan`, with names as in
-            `RegionMap`.
+            `RegionMap`; for forced oscillators the whole span, without a name.
         oscillator: The given oscillator; for a function the one at the first value.
         name: Name of the parameter: its path, or the name of the function's argument.
         as_paper: Whether the path lies in the plane of the paper's Fig. 6, so that pictures show
@@ -326,7 +326,7 @@ def _forced_diagram(osc: Any, where: Any, span: Any, start: Any) -> BifurcationD
     return BifurcationDiagram(
         points=tuple(given_point(point, variation) for point in points),
         branches=tuple(replace(one, values=one.values * unit) for one in branches),
-        regions=(),
+        regions=((first, last, ""),),
         oscillator=osc if isinstance(osc, Oscillator) else given.oscillator(np.array([first])),
         name=variation.names[0],
         as_paper=False,

@@ -32,7 +32,6 @@ from ..checks import as_array, check_finite, is_concrete, require
 from ..cycles.chains import Loop
 from ..cycles.clocked import (
     TimedChain,
-    extremes_along,
     guards_along,
     least_steps,
     monodromy,
@@ -47,6 +46,7 @@ from ..cycles.periodic import (
     Followed,
     PeriodicMotion,
     attracted,
+    extrema_of,
     motion_at,
     motions_of,
     nothing_found,
@@ -366,8 +366,7 @@ def place_of_motion(motion: PeriodicMotion) -> np.ndarray:
     """Smallest and largest x1, the same of x2, and the period, [5]."""
     if int(motion.status) != Status.OK:
         return np.full(5, np.nan)
-    extremes = extremes_along(motion.oscillator, motion.chain, motion.unknowns)
-    return np.append(np.asarray(extremes), float(motion.period))
+    return np.append(np.asarray(extrema_of(motion)), float(motion.period))
 
 
 def forced_point(

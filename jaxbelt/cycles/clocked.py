@@ -26,7 +26,7 @@ from jaxtyping import Array
 
 from ..checks import require
 from ..model.instants import carried, guards_at, trend_of
-from ..model.modes import Mode, capacity, mode_acceleration, mode_of, select
+from ..model.modes import capacity, mode_acceleration, mode_of, select
 from ..model.oscillator import Oscillator, at_time, frequencies
 from ..motion.arcs import Ends
 from ..motion.integrators import density
@@ -56,6 +56,8 @@ LEAST_STEPS, PLACING = 8 * ARC_STEPS, 2
 RATIOS = 64
 #: A boundary or limit that is passed by less is touched.
 TOUCHES_AGAIN = 1e-8
+#: Newton steps from where a quintic has an extremum to where the motion has it.
+EXTREMUM_STEPS = 2
 
 
 class TimedChain(Chain):
@@ -377,19 +379,20 @@ def least_guard(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: 
     """The least value that a guard of its mode has along an arc, up to rounding."""
     mode = mode_of(codes)
     states = states_along(osc, codes, mesh, y, duration)
-    _, values = _least_in_steps(osc, mode, states, lambda y: guards_at(osc, mode, y))
-    return jnp.min(values)
+    least, _ = _least_between(osc, codes, states, lambda y: guards_at(osc, mode, y))
+    return jnp.min(least)
 
 
-def _least_in_steps(
-    osc: Oscillator, mode: Mode, states: Array, numbers: Callable
+def _least_between(
+    osc: Oscillator, codes: Array, states: Array, function: Callable
 ) -> tuple[Array, Array]:
-    """Where in each step of an arc each of some numbers of the state is least, as a fraction of the
-    step, and its value there, [steps, numbers]; inf where it is not finite.
+    """The least values of functions of the state between the ends of an arc's steps, and where, as
+    fractions of the steps, [steps, functions] each.
 
-    Between the ends of steps a number is the quintic with its values, slopes and curvatures there.
+    There a function is the quintic with its values, slopes and curvatures at both ends.
     """
-    at = jax.vmap(lambda y: trend_of(osc, mode, numbers, (y[0], y[1], y[2])))(states)
+    mode = mode_of(codes)
+    at = jax.vmap(lambda y: trend_of(osc, mode, function, (y[0], y[1], y[2])))(states)
     there = jnp.isfinite(at.value)
     h = jnp.diff(states[:, 2])[:, None]
     value, slope, curvature = (jnp.where(there, one, 0.0) for one in at)
@@ -404,13 +407,12 @@ def _least_in_steps(
 
     places = jnp.linspace(0.0, 1.0, 9)
     values = jnp.stack([quintic(s) for s in places])
-    s = nearest = places[jnp.argmin(values, axis=0)]
+    s = places[jnp.argmin(values, axis=0)]
     for _ in range(4):
         first, second = _derivatives(powers, s)
         s = jnp.clip(s - first / jnp.where(second > 0, second, jnp.inf), 0.0, 1.0)
-    before, least = jnp.min(values, axis=0), quintic(s)
-    place = jnp.where(least <= before, s, nearest)
-    return place, jnp.where(there[:-1], jnp.minimum(before, least), jnp.inf)
+    least = jnp.minimum(jnp.min(values, axis=0), quintic(s))
+    return jnp.where(there[:-1], least, jnp.inf), s
 
 
 def _derivatives(powers: list[Array], s: Array) -> tuple[Array, Array]:
@@ -419,39 +421,59 @@ def _derivatives(powers: list[Array], s: Array) -> tuple[Array, Array]:
     return jnp.asarray(first), jnp.asarray(second)
 
 
-@jit
-def extremes_along(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
-    """The least and the largest x1, and the same of x2, of a closed chain with the unknowns z, [4].
+#: What is least where x1, and x2, is smallest or largest.
+_SIDES = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
-    Where they are is found first; there the state depends on the oscillator and on z, and by the
-    time it does not change.
+
+def extrema_along(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
+    """The smallest and the largest x1, and those of x2, of a solution of the equations, [4].
+
+    Differentiable by the oscillator and the unknowns, twice.
     """
 
     def one(osc, codes, mesh, unknown):
-        """The fraction of the duration of an arc at which each is, and its value with the sign that
-        makes it the least, [2, 4]."""
         states = states_along(osc, codes, mesh, unknown[:3], unknown[3])
-        places, values = _least_in_steps(
-            osc, mode_of(codes), states, lambda y: jnp.stack([y[0], -y[0], y[1], -y[1]])
+        still = lax.stop_gradient((osc, states))
+        guess = _least_between(still[0], codes, still[1], lambda y: _SIDES @ jnp.stack(y[:2]))
+        return jax.vmap(functools.partial(_least, osc, codes, states))(
+            _SIDES, *(x.T for x in guess)
         )
-        step, each = jnp.argmin(values, axis=0), jnp.arange(4)
-        begins, lengths = states[:-1, 2] - states[0, 2], jnp.diff(states[:, 2])
-        since = begins[step] + places[step, each] * lengths[step]
-        share = since / jnp.where(unknown[3] > 0, unknown[3], 1.0)
-        return jnp.stack([share, values[step, each]])
 
-    still, at = lax.stop_gradient((osc, z))
-    found = arc_by_arc(one)((still,), (chain.codes, chain.mesh, at))
-    values = jnp.where(chain.used[:, None], found[:, 1], jnp.inf)
-    arcs = jnp.argmin(values, axis=0)
-    shares = lax.stop_gradient(found[arcs, 0, jnp.arange(4)])
+    least = jnp.min(arc_by_arc(one)((osc,), (chain.codes, chain.mesh, z)), axis=0)
+    return least * np.sum(_SIDES, axis=1)
 
-    def state(arc, share):
-        y, duration = z[arc, :3], share * z[arc, 3]
-        return flow(osc, chain.codes[arc], chain.mesh[arc], y, duration)[:2]
 
-    states = jax.vmap(state)(arcs, shares)
-    return states[jnp.arange(4), jnp.array([0, 0, 1, 1])]
+def _least(
+    osc: Oscillator,
+    codes: Array,
+    states: Array,
+    weight: Array | np.ndarray,
+    least: Array,
+    at: Array,
+):
+    """The least value of weight (x1, x2) along an arc, from the quintics' least values and their
+    places between the ends of steps, [steps] each."""
+    mode, step = mode_of(codes), jnp.argmin(least)
+    before, s = states[step], at[step]
+    h = states[step + 1, 2] - before[2]
+
+    def state(s):
+        slipped = arc_step(functools.partial(slip_slopes, osc, codes), before, s * h, FINE)
+        held = jnp.stack(carried(osc, mode, (before[0], before[1], before[2]), s * h))
+        return jnp.where(mode.any_stuck, held, slipped)
+
+    def function(y):
+        return jnp.dot(weight, jnp.stack(y[:2]))
+
+    for _ in range(EXTREMUM_STEPS):
+        s = lax.stop_gradient(s)
+        y = state(s)
+        found = trend_of(osc, mode, function, (y[0], y[1], y[2]))
+        bends = (found.curvature > 0) & (h > 0)
+        new = s - found.slope / jnp.where(bends, found.curvature * h, 1.0)
+        # At the end of an arc a coordinate may have a kink, and be extreme for that.
+        s = jnp.where(bends & (s > 0) & (s < 1) & (new > 0) & (new < 1), new, s)
+    return function(state(s))
 
 
 def timed_admissible(osc: Oscillator, chain: TimedChain, z: Array) -> Array:

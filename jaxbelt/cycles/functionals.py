@@ -1,10 +1,10 @@
 """Functionals: one number of a cycle, to be swept, plotted, fitted or designed.
 
-Each takes a `Cycle`, and all but `gap` and the energies take the `PeriodicMotion` of a forced
-oscillator, too, whose loop is all its periods. They return a scalar that is differentiable with
-respect to the oscillator's parameters, forward and reverse, and work on batches under `jax.vmap`.
-All quantities are dimensionless: times in units of 1/omega, energies in units of k L^2 where L is
-the unit of length. Where the status of the cycle is not OK they are NaN.
+Each takes a `Cycle`, and all but `gap` and the energies a `PeriodicMotion`, too. It returns a
+scalar that is differentiable with respect to the oscillator's parameters, forward and reverse, and
+works on batches under `jax.vmap`. All quantities are dimensionless: times in units of 1/omega,
+energies in units of k L^2 where L is the unit of length. Where the status of the cycle is not OK
+they are NaN.
 """
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..activity import announced
-from ..checks import check_belt, require, require_one_of, require_value
+from ..checks import check_belt, require_one_of, require_value
 from ..model.modes import Mode, mode_acceleration
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import jit
@@ -26,22 +26,22 @@ from .shooting import flow
 
 
 def period(cycle: Cycle | PeriodicMotion) -> Array:
-    """Duration of one loop.
+    """Duration of one loop, of a forced motion of all the periods after which it repeats.
 
     Args:
-        cycle: A cycle, from `find_cycle` for example.
+        cycle: A cycle, or a motion of a forced oscillator, from `find_cycle` for example.
 
     Returns:
         The period, in dimensionless time tau.
     """
-    return _checked_cycle(cycle).period
+    return _checked_motion(cycle).period
 
 
 def stick_duration(cycle: Cycle | PeriodicMotion, belt: int | None = None) -> Array:
     """Time per loop for which the mass sticks to a belt, summed over its stick phases.
 
     Args:
-        cycle: A cycle, from `find_cycle` for example.
+        cycle: A cycle, or a motion of a forced oscillator, from `find_cycle` for example.
         belt: Number of the belt; None: any belt.
 
     Returns:
@@ -52,7 +52,7 @@ def stick_duration(cycle: Cycle | PeriodicMotion, belt: int | None = None) -> Ar
     """
     if belt is None:
         stuck = jnp.where(_is_stuck(cycle), 1.0, 0.0)
-        return jnp.sum(_durations(cycle) * stuck, axis=-1)
+        return jnp.sum(cycle.unknowns[..., -1] * stuck, axis=-1)
     number = _belt_index(cycle, belt)
     return cycle.stick_durations[..., number]
 
@@ -61,7 +61,7 @@ def slip_duration(cycle: Cycle | PeriodicMotion, belt: int | None = None) -> Arr
     """Time per loop for which the mass touches a belt and slips on it.
 
     Args:
-        cycle: A cycle, from `find_cycle` for example.
+        cycle: A cycle, or a motion of a forced oscillator, from `find_cycle` for example.
         belt: Number of the belt; None: time for which the mass sticks to no belt.
 
     Returns:
@@ -71,18 +71,18 @@ def slip_duration(cycle: Cycle | PeriodicMotion, belt: int | None = None) -> Arr
         ValueError: If there is no such belt.
     """
     if belt is None:
-        return _checked_cycle(cycle).period - stick_duration(cycle)
+        return _checked_motion(cycle).period - stick_duration(cycle)
     number = _belt_index(cycle, belt)
     codes = cycle.chain.codes[..., number]
     slips = jnp.where(jnp.abs(codes) == 1, 1.0, 0.0)
-    return jnp.sum(_durations(cycle) * slips, axis=-1)
+    return jnp.sum(cycle.unknowns[..., -1] * slips, axis=-1)
 
 
 def stick_fraction(cycle: Cycle | PeriodicMotion, belt: int | None = None) -> Array:
     """Fraction of a loop for which the mass sticks to a belt.
 
     Args:
-        cycle: A cycle, from `find_cycle` for example.
+        cycle: A cycle, or a motion of a forced oscillator, from `find_cycle` for example.
         belt: Number of the belt; None: any belt.
 
     Returns:
@@ -98,7 +98,7 @@ def amplitude(cycle: Cycle | PeriodicMotion, coordinate: str = "x1") -> Array:
     """Half the difference of the largest and the smallest value of a coordinate in a loop.
 
     Args:
-        cycle: A cycle, from `find_cycle` for example.
+        cycle: A cycle, or a motion of a forced oscillator, from `find_cycle` for example.
         coordinate: "x1" or "x2".
 
     Returns:
@@ -112,14 +112,14 @@ def peak(cycle: Cycle | PeriodicMotion, coordinate: str = "x1") -> Array:
     """Largest absolute value of a coordinate in a loop.
 
     Args:
-        cycle: A cycle, from `find_cycle` for example.
+        cycle: A cycle, or a motion of a forced oscillator, from `find_cycle` for example.
         coordinate: "x1" or "x2".
 
     Returns:
         The peak, dimensionless.
     """
     least, largest = _range(cycle, coordinate)
-    return jnp.maximum(jnp.abs(least), jnp.abs(largest))
+    return jnp.maximum(-least, largest)
 
 
 def gap(cycle: Cycle, belt: int) -> Array:
@@ -137,7 +137,7 @@ def gap(cycle: Cycle, belt: int) -> Array:
     Raises:
         ValueError: If there is no such belt.
     """
-    belt = _belt_index(_without_forcing(cycle), belt)
+    belt = _belt_index(_checked_cycle(cycle), belt)
     osc = cycle.oscillator
     boundary = osc.belts[belt].velocity / osc.omega
     return jnp.maximum(boundary - cycle.x2_max, cycle.x2_min - boundary)
@@ -155,7 +155,7 @@ def energy_fed(cycle: Cycle) -> Array:
     Returns:
         The energy, dimensionless.
     """
-    return _energies(_without_forcing(cycle))[0]
+    return _energies(_checked_cycle(cycle))[0]
 
 
 @announced("energy_dissipated")
@@ -168,7 +168,7 @@ def energy_dissipated(cycle: Cycle) -> Array:
     Returns:
         The energy, dimensionless.
     """
-    return _energies(_without_forcing(cycle))[1]
+    return _energies(_checked_cycle(cycle))[1]
 
 
 #: Quantity of each functional: the name of one of `Units`, its `coordinate`, or a number.
@@ -187,35 +187,28 @@ MEASURED_IN: dict[Callable[..., Array], str] = {
 
 def _checked_cycle(cycle: Any) -> Any:
     expected = "a Cycle, such as jb.find_cycle(...)"
-    require_value(isinstance(cycle, Cycle | PeriodicMotion), "cycle", expected, cycle)
+    forced = " of an oscillator without forcing" if isinstance(cycle, PeriodicMotion) else ""
+    require_value(isinstance(cycle, Cycle), "cycle", expected + forced, cycle)
     return cycle
 
 
-def _without_forcing(cycle: Any) -> Cycle:
-    forced = isinstance(_checked_cycle(cycle), PeriodicMotion)
-    require(not forced, "cycle", "of an oscillator without forcing", "a PeriodicMotion")
-    return cycle
+def _checked_motion(cycle: Any) -> Cycle | PeriodicMotion:
+    return cycle if isinstance(cycle, PeriodicMotion) else _checked_cycle(cycle)
 
 
-def _is_stuck(cycle: Any) -> Array:
-    return jnp.any(_checked_cycle(cycle).chain.codes == 0, axis=-1)
+def _is_stuck(cycle: Cycle | PeriodicMotion) -> Array:
+    return jnp.any(_checked_motion(cycle).chain.codes == 0, axis=-1)
 
 
-def _belt_index(cycle: Any, belt: int) -> int:
-    check_belt(belt, len(_checked_cycle(cycle).oscillator.belts))
+def _belt_index(cycle: Cycle | PeriodicMotion, belt: int) -> int:
+    check_belt(belt, len(_checked_motion(cycle).oscillator.belts))
     return belt
 
 
-def _durations(cycle: Any) -> Array:
-    return cycle.unknowns[..., -1]
-
-
-def _range(cycle: Any, coordinate: str) -> tuple[Array, Array]:
+def _range(cycle: Cycle | PeriodicMotion, coordinate: str) -> tuple[Array, Array]:
     require_one_of(coordinate, ("x1", "x2"), "coordinate")
-    cycle = _checked_cycle(cycle)
-    if coordinate == "x1":
-        return cycle.x1_min, cycle.x1_max
-    return cycle.x2_min, cycle.x2_max
+    motion = _checked_motion(cycle)
+    return getattr(motion, f"{coordinate}_min"), getattr(motion, f"{coordinate}_max")
 
 
 @jit

@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -39,7 +40,7 @@ from ..tables import per_belt, require_single, table_of
 from .chains import SIZES, Loop, loop_events
 from .clocked import (
     TimedChain,
-    extremes_along,
+    extrema_along,
     forcing_period,
     least_steps,
     monodromy,
@@ -135,26 +136,22 @@ class PeriodicMotion(eqx.Module):
     @property
     def x1_min(self) -> Array:
         """Smallest displacement."""
-        return self._extremes[0]
+        return extrema_of(self)[..., 0]
 
     @property
     def x1_max(self) -> Array:
         """Largest displacement."""
-        return self._extremes[1]
+        return extrema_of(self)[..., 1]
 
     @property
     def x2_min(self) -> Array:
         """Smallest velocity."""
-        return self._extremes[2]
+        return extrema_of(self)[..., 2]
 
     @property
     def x2_max(self) -> Array:
         """Largest velocity."""
-        return self._extremes[3]
-
-    @property
-    def _extremes(self) -> Array:
-        return extremes_along(self.oscillator, self.chain, self.unknowns)
+        return extrema_of(self)[..., 3]
 
     @property
     def stable(self) -> Array:
@@ -212,7 +209,10 @@ class PeriodicMotion(eqx.Module):
         require_single(self, self.residual, 0)
         known = int(self.status) == Status.OK
         start, (first, second) = np.asarray(self.start), np.asarray(self.multipliers)
+        extrema = np.asarray(extrema_of(self))
         numbers = {
+            **dict(zip(("x1_min", "x1_max", "x2_min", "x2_max"), extrema, strict=True)),
+            "amplitude": 0.5 * (extrema[1] - extrema[0]),
             "period": self.period,
             "x1": start[0],
             "x2": start[1],
@@ -233,9 +233,9 @@ class PeriodicMotion(eqx.Module):
         }
 
     def table(self) -> "pandas.DataFrame":
-        """One row: stable, periods, period, x1 and x2 at the phase 0, real and imaginary parts of
-        both multipliers, stick_duration_0, ... of each belt, residual, iterations, signature,
-        status."""
+        """One row: stable, periods, x1_min, x1_max, x2_min, x2_max, amplitude (half the range of
+        x1), period, x1 and x2 at the phase 0, real and imaginary parts of both multipliers,
+        stick_duration_0, ... of each belt, residual, iterations, signature, status."""
         return table_of([self.row()])
 
     def plot(self, ax: Any = None) -> Any:
@@ -257,6 +257,17 @@ class PeriodicMotion(eqx.Module):
             f"multipliers {told}, {'' if self.stable else 'un'}stable, "
             f"residual {float(self.residual):.1e})"
         )
+
+
+def extrema_of(motion: PeriodicMotion) -> Array:
+    """Smallest and largest x1, and those of x2, of a motion or of each of a batch, [..., 4]."""
+    function = _extrema
+    for _ in range(motion.unknowns.ndim - 2):
+        function = jax.vmap(function)
+    return function(motion.oscillator, motion.chain, motion.unknowns)
+
+
+_extrema = jit(extrema_along)
 
 
 @jit
@@ -460,7 +471,7 @@ def nothing_found(osc: Oscillator, turns: int, status: int) -> PeriodicMotion:
 def periodic_from(osc: Oscillator, guess: Any, periods: int, turns: int) -> PeriodicMotion:
     """What `periodic` returns, of a known oscillator in its own units."""
     y = np.asarray(guess, float)
-    motion = None
+    motion, begun_again = None, False
     for _ in range(OUTER_STEPS):
         followed = arcs_over(osc, y, turns)
         if len(followed.starts) <= periods:
@@ -469,7 +480,13 @@ def periodic_from(osc: Oscillator, guess: Any, periods: int, turns: int) -> Peri
         followed = followed.first(periods)
         motion = solved_from(osc, followed.loop(), turns)
         if int(motion.status) in (Status.OK, Status.NEUTRAL):
-            return _of_least_periods(osc, motion, turns)
+            goes_on = np.array_equal(followed.codes[0], followed.codes[-1])
+            if goes_on or begun_again:
+                return _of_least_periods(osc, motion, turns)
+            # It begins in another mode than it ends in: an arc of no duration is before an event.
+            y = after_period(osc, followed._replace(starts=np.asarray(motion.start)[None]))
+            begun_again = True
+            continue
         change = _period_step(osc, followed, turns)
         size = float(np.max(np.abs(change)))
         if not np.isfinite(size):

@@ -14,6 +14,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ..activity import announced
 from ..checks import require, require_one_of, require_value
+from ..cycles.periodic import PeriodicMotion
 from ..sweeps.basins import Basins, BasinStability, standard_error
 from ..sweeps.datasets import decoded
 from ..sweeps.fractions import BasinFractions
@@ -197,9 +198,11 @@ def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:
     limits: dict[str, Any] = dict(xlim=(x1[0], x1[-1]), ylim=(x2[0], x2[-1]))
     cycles = [c for c in (*basins.cycles, basins.boundary) if c is not None and int(c.status) == 0]
     if basins.boundary is None:
-        for motion, mark in zip(cycles, cycle("osD^v"), strict=False):
-            style = dict(marker=mark, mec="black", mfc="white", ls="none", ms=5)
-            ax.plot(*np.asarray(motion.starts).T, **style, label=f"{motion.periods}-periodic")
+        motions = [one for one in cycles if isinstance(one, PeriodicMotion)]
+        for motion, mark in zip(motions, cycle("osD^v"), strict=False):
+            style: dict[str, Any] = {"marker": mark, "mec": "black", "mfc": "white", "ls": "none"}
+            states = np.asarray(motion.starts)
+            ax.plot(*states.T, **style, label=f"{len(states)}-periodic")
         ax.set(xlabel="displacement $x_1$", ylabel="velocity $x_2$", **limits)
     else:
         plot_phase_portrait(basins.oscillator, cycles=cycles, **limits, ax=ax)

@@ -227,7 +227,7 @@ class Basins(eqx.Module):
 CHORDS = 4000
 
 
-def _away_from_cycle(cycle: Cycle, states: np.ndarray) -> np.ndarray:
+def _away_from_cycle(cycle: Any, states: np.ndarray) -> np.ndarray:
     """Distances of states, [n, 2], from a cycle, [n]; NaN where there is no cycle."""
     from scipy.spatial import KDTree  # late, as only this needs it
 

@@ -42,7 +42,7 @@ def forced_labels(osc: Oscillator, dataset: "xarray.Dataset") -> list[Found]:
         if kind == "periodic":
             same &= periods == periods[first]
             same &= distance(places, places[first]) < error
-            motion = _motion_of(osc, places[first], int(periods[first]))
+            motion = _motion_near(osc, places[first], int(periods[first]))
             before = next((one for one in found if one.is_of(motion)), None)
         elif kind == "equilibrium":
             same &= distance(places, places[first], float(dataset.attrs["length"])) < error
@@ -56,7 +56,7 @@ def forced_labels(osc: Oscillator, dataset: "xarray.Dataset") -> list[Found]:
     return found
 
 
-def _motion_of(osc: Oscillator, place: np.ndarray, n: int) -> PeriodicMotion:
+def _motion_near(osc: Oscillator, place: np.ndarray, n: int) -> PeriodicMotion:
     """The motion that a run has come to; with the status NO_CONVERGENCE where Newton's method leads
     to none, or to another."""
     motion = periodic(osc, place[4:], periods=n)

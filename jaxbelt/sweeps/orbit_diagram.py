@@ -41,6 +41,7 @@ from .grid import Grid
 from .moments import AtEvents, AtExtrema, AtPhase, AtSection
 from .question import LONG_ENOUGH
 from .reducers import check_sections
+from .strobes import SAME
 from .work import results_of
 
 if TYPE_CHECKING:
@@ -55,10 +56,8 @@ MOST_RUNS = 64
 #: A run through a loop goes on beyond it by this fraction of the period.
 OUTSIDE = 1e-4
 
-#: Of a forced oscillator: periods that are left out at first, points that are kept, and by how much
-#: they may differ, over their size, to be those of a periodic motion.
+#: Of a forced oscillator: periods that are left out at first, and points that are kept.
 PERIODS_LEFT_OUT, STROBES = 1000, 64
-SAME = 1e-6
 #: The kind of such points without a period: of chaos, of a torus, or of a slow approach.
 NOT_PERIODIC = "no period found"
 

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..cycles.exponents import BLOCKS
 from ..kernel.clocked import of_lanes
 from ..kernel.lanes import Lanes, Observer, Variable, choose, materialise
 from ..model.instants import field_at, guards_at
@@ -32,11 +33,12 @@ from ..model.oscillator import at_time, frequencies
 from ..model.own_units import OwnOscillator
 from ..numerics.compiling import where_any
 from ..results import Status
-from .moments import Course
+from .attractor import EQUILIBRIUM, STUCK_FOR_EVER, UNDECIDED
+from .moments import LEAST_CUT, Course
 
 #: Kinds of attractors of forced oscillators, in the order of their codes.
-FORCED_KINDS = ("undecided", "periodic", "quasiperiodic", "chaotic", "stuck", "equilibrium")
-UNDECIDED, PERIODIC, QUASIPERIODIC, CHAOTIC, STUCK_FOR_EVER, EQUILIBRIUM = range(6)
+FORCED_KINDS = ("undecided", "equilibrium", "periodic", "stuck", "quasiperiodic", "chaotic")
+PERIODIC, QUASIPERIODIC, CHAOTIC = 2, 4, 5
 
 #: Most turns of the first force that are searched for a period that all frequencies have in common,
 #: and how far from whole the turns of the others may be.
@@ -51,14 +53,14 @@ CONFIRMED = 16
 #: has to go, and so many times as far as errors.
 APART, APART_OF_ERRORS = 10.0, 1000.0
 #: Strobes after which a state is no longer waited for at first; then twice as many, and so on.
-PATIENCE = 8
-#: Share of a run before its exponent is measured; blocks whose means tell the standard error.
-TRANSIENT, BLOCKS = 0.25, 25
-#: Standard errors within which an exponent is zero; per period the error of its computation, and how
-#: large both may be together where a motion is quasiperiodic.
+FIRST_PATIENCE = 8
+#: Share of a run before its exponent is measured.
+UNMEASURED = 0.25
+#: Standard errors within which an exponent is zero; per period the error of its computation, and
+#: how large both may be together where a motion is quasiperiodic.
 DEVIATIONS, COMPUTED, RESOLVED = 3.0, 1e-4, 0.01
 #: An extremum is known from a point that is this near in time; steps are cut until there is one.
-NEAR, LEAST_CUT = 1e-3, 1e-3
+NEAR_EXTREMUM = 1e-3
 
 
 class _Repeats(eqx.Module):
@@ -126,7 +128,7 @@ class _Growth(eqx.Module):
     sticks: Array
 
 
-class _Seen(eqx.Module):
+class _RunSoFar(eqx.Module):
     """Memory of the observers, arrays [lanes].
 
     strobes: number of the next strobe, counted from t = 0; turns: of the first force from one to
@@ -161,11 +163,11 @@ class Strobed(Observer):
                 whole = whole & (jnp.abs(ratio - jnp.round(ratio)) <= WHOLE * m)
             turns = jnp.where(whole, m, turns)
         turns = turns.astype(count.dtype)
-        passed = jnp.floor(lanes.t / _period(osc, turns) * (1 + 1e-14) + 1e-12)
+        passed = jnp.floor(lanes.t / _strobe_period(osc, turns) * (1 + 1e-14) + 1e-12)
         nowhere = zero + jnp.nan
         start = jnp.full_like(count, -1)
         repeats = _Repeats(
-            nowhere, nowhere, start, count + PATIENCE, count, count, zero, zero + jnp.inf
+            nowhere, nowhere, start, count + FIRST_PATIENCE, count, count, zero, zero + jnp.inf
         )
         growth = _Growth(
             d1=zero + np.cos(1.0),
@@ -178,7 +180,7 @@ class Strobed(Observer):
             squares=zero,
             sticks=zero > 0,
         )
-        return _Seen(
+        return _RunSoFar(
             strobes=(passed + 1).astype(count.dtype),
             turns=turns,
             repeats=repeats,
@@ -192,8 +194,8 @@ class Strobed(Observer):
     # --- steps
 
     def follow(self, take_step, osc, window, ones, lanes, t1, rtol, atol):
-        seen: _Seen = lanes.memory
-        strobe = seen.strobes.astype(lanes.t.dtype) * _period(osc, seen.turns)
+        seen: _RunSoFar = lanes.memory
+        strobe = seen.strobes.astype(lanes.t.dtype) * _strobe_period(osc, seen.turns)
         until = jnp.where(strobe > lanes.t, jnp.minimum(t1, strobe), t1)
         new = take_step(osc, window, ones, lanes, until, rtol, atol)
         stuck = lanes.mode.any_stuck
@@ -230,11 +232,13 @@ class Strobed(Observer):
             extent = extent.with_point(jnp.where(slips, x1, one.x1), jnp.where(slips, x2, one.x2))
         return extent
 
-    def _cut(self, seen: _Seen, lanes: Lanes, new: Lanes, course: Course, stuck, h, ones) -> Array:
+    def _cut(
+        self, seen: _RunSoFar, lanes: Lanes, new: Lanes, course: Course, stuck, h, ones
+    ) -> Array:
         """The fraction of a step that ends at its first extremum of x1 or x2; 1 where there is none
         inside, or where none is wanted."""
         theta = jnp.ones_like(h)
-        asked = (seen.repeats.n > 0) & ~stuck & (h > NEAR)
+        asked = (seen.repeats.n > 0) & ~stuck & (h > NEAR_EXTREMUM)
         ends = ((lanes.x2, lanes.a), (new.x2, new.a)), ((lanes.a, None), (new.a, None))
         for order, ((start, _), (end, _)) in enumerate(ends):
             values = [start, *(_rate_of(course, order, k / 4) for k in (1, 2, 3)), end]
@@ -242,14 +246,18 @@ class Strobed(Observer):
                 a, b = values[k], values[k + 1]
                 crosses = (a * b < 0) & asked
                 root = (k + a / jnp.where(crosses, a - b, 1.0)) / 4
-                inside = crosses & (root * h > NEAR * 0.5) & ((1 - root) * h > NEAR * 0.5)
+                inside = (
+                    crosses
+                    & (root * h > NEAR_EXTREMUM * 0.5)
+                    & ((1 - root) * h > NEAR_EXTREMUM * 0.5)
+                )
                 inside = inside & (root > LEAST_CUT) & (root < 1 - LEAST_CUT)
                 theta = jnp.where(inside, jnp.minimum(theta, root), theta)
         return materialise(theta, ones)
 
     # --- strobes
 
-    def _strobed(self, seen: _Seen, lanes: Lanes, due: Array, tol: Array) -> _Seen:
+    def _strobed(self, seen: _RunSoFar, lanes: Lanes, due: Array, tol: Array) -> _RunSoFar:
         """The memory behind a strobe, where one is due."""
         now, known = seen.strobes, seen.repeats
         extent, x1, x2 = seen.extent, lanes.x1, lanes.x2
@@ -264,7 +272,7 @@ class Strobed(Observer):
         back = away <= close
         sooner = back & ((known.n == 0) | (since < known.n))
         turn = (known.n > 0) & (since == known.n)
-        left = _way_left(away, known.moved)
+        left = _rest_of_way(away, known.moved)
         shrinks = (away <= errors) | (away < known.moved)
         again = turn & back & shrinks & ~sooner
         lost = turn & ~again & ~sooner
@@ -307,7 +315,7 @@ class Strobed(Observer):
     # --- events
 
     def watch(self, osc, lanes, passage, ones, t1, tol):
-        seen: _Seen = lanes.memory
+        seen: _RunSoFar = lanes.memory
         growth = seen.growth
 
         def jumped():
@@ -381,12 +389,12 @@ class ForcedAttractor(Strobed):
     }
 
     def finish(self, osc, lanes):
-        seen: _Seen = lanes.memory
+        seen: _RunSoFar = lanes.memory
         extent, growth = seen.extent, seen.growth
         exponent, error = self.exponent(lanes)
         open_ = (seen.kind == UNDECIDED) & (lanes.status == Status.OK.value)
         resolved = open_ & jnp.isfinite(exponent)
-        once = _period(osc, seen.turns)
+        once = _strobe_period(osc, seen.turns)
         doubt = jnp.maximum(DEVIATIONS * error, COMPUTED / once)
         chaotic = resolved & (exponent > doubt)
         even = resolved & (jnp.abs(exponent) <= doubt) & (doubt * once < RESOLVED) & ~growth.sticks
@@ -443,19 +451,19 @@ class LargestExponent(Strobed):
         }
 
 
-def _period(osc: OwnOscillator, turns: Array) -> Array:
+def _strobe_period(osc: OwnOscillator, turns: Array) -> Array:
     """Time between two strobes; a turn where there is no period."""
     first = jnp.abs(frequencies(osc)[0])
     return 2 * np.pi * jnp.maximum(turns, 1).astype(first.dtype) / first
 
 
 def _way_to_zero(value: Array, slope: Array, h: Array) -> Array:
-    """Time to where a value vanishes, 0 where that is farther than `NEAR`."""
+    """Time to where a value vanishes, 0 where that is farther than `NEAR_EXTREMUM`."""
     way = -value / jnp.where(slope == 0, 1.0, slope)
-    return jnp.where((slope != 0) & (jnp.abs(way) <= NEAR) & (h > 0), way, 0.0)
+    return jnp.where((slope != 0) & (jnp.abs(way) <= NEAR_EXTREMUM) & (h > 0), way, 0.0)
 
 
-def _way_left(away: Array, moved: Array) -> Array:
+def _rest_of_way(away: Array, moved: Array) -> Array:
     """How far repeats still go, if each is nearer by the same factor; inf where they are not."""
     shrinks = away < moved
     left = away * away / jnp.where(shrinks, moved - away, 1.0)
@@ -510,7 +518,7 @@ def _counted(growth: _Growth, t: Array, t1: Array) -> _Growth:
     size = jnp.hypot(growth.d1, growth.d2)
     size = jnp.where((size > 0) & jnp.isfinite(size), size, 1.0)
     log = growth.log + jnp.log(size)
-    first = growth.began + TRANSIENT * (t1 - growth.began)
+    first = growth.began + UNMEASURED * (t1 - growth.began)
     length = (t1 - first) / BLOCKS
     over = t >= first + (growth.blocks + 1).astype(t.dtype) * length - 1e-9 * length
     elapsed = t - growth.since
