@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..cycles.exponents import BLOCKS
+from ..cycles.settling import way_left
 from ..kernel.clocked import of_lanes
 from ..kernel.lanes import Lanes, Observer, Variable, choose, materialise
 from ..model.instants import field_at, guards_at
@@ -272,7 +273,7 @@ class Strobed(Observer):
         back = away <= close
         sooner = back & ((known.n == 0) | (since < known.n))
         turn = (known.n > 0) & (since == known.n)
-        left = _rest_of_way(away, known.moved)
+        left = away * way_left(away, known.moved)
         shrinks = (away <= errors) | (away < known.moved)
         again = turn & back & shrinks & ~sooner
         lost = turn & ~again & ~sooner
@@ -461,14 +462,6 @@ def _way_to_zero(value: Array, slope: Array, h: Array) -> Array:
     """Time to where a value vanishes, 0 where that is farther than `NEAR_EXTREMUM`."""
     way = -value / jnp.where(slope == 0, 1.0, slope)
     return jnp.where((slope != 0) & (jnp.abs(way) <= NEAR_EXTREMUM) & (h > 0), way, 0.0)
-
-
-def _rest_of_way(away: Array, moved: Array) -> Array:
-    """How far repeats still go, if each is nearer by the same factor; inf where they are not."""
-    shrinks = away < moved
-    left = away * away / jnp.where(shrinks, moved - away, 1.0)
-    left = jnp.where(jnp.isinf(moved), away, left)
-    return jnp.where(shrinks, left, jnp.inf)
 
 
 def _rate_of(course: Course, order: int, theta: float) -> Array:
