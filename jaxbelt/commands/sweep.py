@@ -32,6 +32,18 @@ VARIABLES = {
     ),
     "final": ("x1_end", "x2_end", "mode_end", "n_events", "status"),
 }
+#: Likewise with `--force`.
+VARIABLES_FORCED = {
+    "attractor": (
+        *("kind", "periods", "sticks", "period", "stick_duration", "x1_min", "x1_max"),
+        *("x2_min", "x2_max", "x1_strobe", "x2_strobe", "exponent", "exponent_error"),
+        *("transient", "n_events", "status"),
+    ),
+    "final": VARIABLES["final"],
+    "lyapunov": ("exponent", "exponent_error", "n_events", "status"),
+}
+#: Default t1 by `--observe`; None: that of `jaxbelt.sweep`.
+ENDS = {"attractor": None, "final": 100.0, "lyapunov": 1000.0}
 #: Variables with a number for each belt: too many for a picture.
 OF_BELTS = ("sticks", "stick_duration", "mode_end")
 
@@ -49,7 +61,11 @@ def sweep(
     ],
     described: Description,
     observe: Annotated[
-        str, typer.Option(help="attractor (what each run leads to) or final (where it ends).")
+        str,
+        typer.Option(
+            help="attractor (what each run leads to), final (where it ends) or, with --force, "
+            "lyapunov (its largest exponent)."
+        ),
     ] = "attractor",
     variable: Annotated[
         str | None,
@@ -62,7 +78,8 @@ def sweep(
     t1: Annotated[
         float | None,
         typer.Option(
-            help="End of each run.", show_default="30000 for attractors, 100 for the final state"
+            help="End of each run.",
+            show_default="30000 for attractors, 100 for the final state, 1000 for exponents",
         ),
     ] = None,
     tolerance: Annotated[
@@ -113,6 +130,8 @@ def sweep(
     - jaxbelt sweep nu0=0:1:64 "belts[0].friction.kinetic=0.2:0.8:64" --belt
       0.5,law=coulomb,static=0.8,kinetic=0.5 --damping 0.1
 
+    - jaxbelt sweep "forcing[0].frequency=0.5:2:64" nu0=0.1:1:64 --class a --force 0.5,1.2
+
     - jaxbelt sweep nu0=-0.7:0.7:8192 nu1=-0.7:0.7:8192 --out plane.zarr --blocks 0:64
     """
     console = make_console()
@@ -125,12 +144,13 @@ def sweep(
         parsed = list(map(parse_axis, axes))
         described.check_axes([name for name, _ in parsed], others=("x1", "x2"))
         values = dict(parsed)
-        if observe not in VARIABLES:
-            meant = did_you_mean(observe, VARIABLES)
-            raise ValueError(f"observe must be attractor or final, got {observe}{meant}")
-        shown = variable or VARIABLES[observe][0]
+        known = VARIABLES_FORCED if described.force else VARIABLES
+        if observe not in known:
+            meant = did_you_mean(observe, known)
+            raise ValueError(f"observe must be {' or '.join(known)}, got {observe}{meant}")
+        shown = variable or known[observe][0]
         drawn = part is None and sum(len(axis) > 1 for axis in values.values()) in (1, 2)
-        _check_variable(shown, observe)
+        _check_variable(shown, known[observe])
         asked: dict[str, Any] = dict(y0=start, observe=observe, **tolerances(tolerance))
         if t1 is not None:
             check_number("t1", t1)
@@ -140,9 +160,7 @@ def sweep(
         turn_on_float64()
         own = [name for name in values if name not in ("x1", "x2")]
         make = described.along(own)
-        if t1 is None and observe != "attractor":
-            t1 = 100.0
-        asked["t1"] = t1
+        asked["t1"] = ENDS[observe] if t1 is None else t1
         if dry_run:
             estimate = jb.explain(make, values, **asked)
             say(console, [repr(estimate)], [], as_json=as_json, data=asdict(estimate))
@@ -161,9 +179,9 @@ def sweep(
     say(console, [repr(dataset)], written, as_json=as_json, data=_counts_as_data(dataset))
 
 
-def _check_variable(name: str, observe: str) -> None:
+def _check_variable(name: str, variables: tuple[str, ...]) -> None:
     """Raises unless the picture can show that variable."""
-    known = [one for one in VARIABLES[observe] if one not in OF_BELTS]
+    known = [one for one in variables if one not in OF_BELTS]
     if name not in known:
         meant = did_you_mean(name, known)
         raise ValueError(f"variable must be one of {', '.join(known)}, got {name}{meant}")
