@@ -166,8 +166,6 @@ class Many(jb.AbstractForce):
         jb.equilibria,
         jb.portrait,
         jb.unstable_cycle,
-        partial(jb.basins, x1=np.arange(3.0), x2=np.arange(3.0)),
-        partial(jb.basin_stability, box=((-1, 1), (-1, 1)), n=4, key=jax.random.key(0)),
         partial(jb.minimal_fatal_shock, y0=(1.0, 0.0)),
         partial(jb.scan, where=lambda o: o.damping, span=(0.1, 0.2)),
         partial(jb.refine, jb.Hopf(), where=lambda o: o.damping),
