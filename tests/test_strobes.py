@@ -55,6 +55,7 @@ def test_an_approach_from_two_sides_in_turn_has_the_period_of_its_end(labels):
     assert row.periods == 2 and row.status == Status.OK
 
 
+@pytest.mark.slow(first=True)
 def test_exponents_are_those_of_lyapunov_and_of_multipliers():
     frequencies = [1.69, 1.7077, 1.72, 1.8]
     found = jb.sweep(
@@ -80,6 +81,7 @@ def free(frequency, damping=0.0, amplitude=0.5, load=0.0):
     return jb.Oscillator(damping, (jb.Belt(0.3, jb.Coulomb(1.0, 1.0), load),), forcing=forcing)
 
 
+@pytest.mark.slow(first=True)
 def test_a_torus_a_response_and_a_mass_that_is_held():
     """Without friction and damping the motion is a sum of two frequencies; with damping it ends in
     the linear response; within the capacity of a belt at rest nothing moves."""
@@ -107,6 +109,7 @@ def test_a_torus_a_response_and_a_mass_that_is_held():
     assert np.isinf(found.stick_duration[0, 0]) and found.x1_max[0] == 0.2
 
 
+@pytest.mark.slow(first=True)
 def test_periods_are_those_that_all_frequencies_have_in_common():
     def make(ratio):
         forcing = (jb.Harmonic(0.5, 1.2), jb.Harmonic(0.3, 1.2 * ratio))
@@ -141,6 +144,7 @@ def test_labels_do_not_depend_on_the_unit_of_length(labels, k):
         np.testing.assert_array_equal(found[name], unit * labels[name])
 
 
+@pytest.mark.slow(first=True)
 def test_basins_of_two_attractors():
     """At 1.68 a sticking motion of two periods and chaos: each start as a run of its own says."""
     osc = bernardo(1.68)
@@ -182,6 +186,7 @@ class Energy:
         return dict(zip(("friction", "square", "cosine"), end.integrals, strict=True))
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("velocity", [0.3, jb.Oscillating(0.3, 0.1, 1.2)])
 @pytest.mark.parametrize("end", [9.0, 25.24, 26.0, 30.0])
 def test_integrals_keep_the_balance_of_energy(velocity, end):

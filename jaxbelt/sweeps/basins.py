@@ -78,7 +78,7 @@ class Basins(eqx.Module):
             frequent first (-1: undecided).
         attractors: A few words for each label.
         cycles: Those of the attractors that are cycles, in the same order; of a forced oscillator
-            the `PeriodicMotion`s.
+            each is a `PeriodicMotion`.
         boundary: The unstable cycle, with the status NO_UNSTABLE_CYCLE where there is none; None
             for a forced oscillator.
     """
