@@ -76,6 +76,52 @@ def test_exponents_are_those_of_lyapunov_and_of_multipliers():
             assert value > 3 * error
 
 
+def swinging(V, A, W, L):
+    """One belt whose velocity oscillates: x1 and x2 have extrema inside of stick phases."""
+    law = jb.Conti(1.0, 0.6, 10.0)
+    return jb.Oscillator(0.1, (jb.Belt(jb.Oscillating(V, A, W, 0.3), law, L),))
+
+
+def two_belts(V, A, W, L):
+    """A load that oscillates, an edge, a static limit above the kinetic one."""
+    first = jb.Belt(V, jb.Conti(1.0, 0.6, 10.0), jb.Oscillating(L, 0.4 * L, W, 1.0))
+    second = jb.Belt(-0.2, jb.Coulomb(0.5, 0.4), 0.3, upper=0.5)
+    return jb.Oscillator(0.1, (first, second), forcing=jb.Harmonic(A, W))
+
+
+def steady(V, A, W, L):
+    belt = jb.Belt(V, jb.Conti(1.0, 0.6, 10.0), L)
+    return jb.Oscillator(0.1, (belt,), forcing=jb.Harmonic(A, W))
+
+
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("make", [steady, swinging, two_belts])
+def test_labels_and_exponents_of_random_oscillators(make):
+    rng = np.random.default_rng(11)
+    for i in range(8):
+        drawn = rng.uniform([0.1, 0.1, 0.4, 0.2], [0.6, 1.0, 2.2, 1.0])
+        V, A, W, L = np.maximum(np.round(drawn, 1), 0.1) if i % 2 else drawn
+        axes = {name: [value] for name, value in dict(V=V, A=A, W=W, L=L).items()}
+        run = {"y0": (0.3, 0.1), "t1": 4000.0}
+        label = jb.sweep(make, axes, **run, observe="attractor").squeeze()
+        kind = str(jb.decoded(label).kind.values)
+        motion = jb.find_cycle(make(V, A, W, L), (0.3, 0.1))
+        if motion.status != Status.OK:
+            # It follows up to 16 periods.
+            assert kind != "periodic" or label.periods > 16
+            continue
+        assert kind == "periodic" and label.periods == motion.periods
+        extrema = [label.x1_min, label.x1_max, label.x2_min, label.x2_max]
+        expected = [motion.x1_min, motion.x1_max, motion.x2_min, motion.x2_max]
+        np.testing.assert_allclose(extrema, expected, atol=1e-6)
+        sticks = np.atleast_1d(label.stick_duration)
+        np.testing.assert_allclose(sticks, motion.stick_durations, atol=1e-5)
+        found = jb.sweep(make, axes, **run, observe="lyapunov").squeeze()
+        known = np.log(abs(motion.multipliers[0])) / motion.period
+        room = 5 * found.exponent_error + 3e-3 * abs(known) + 2e-4
+        assert abs(found.exponent - known) < room or known == -np.inf
+
+
 def free(frequency, damping=0.0, amplitude=0.5, load=0.0):
     forcing = jb.Harmonic(amplitude, frequency)
     return jb.Oscillator(damping, (jb.Belt(0.3, jb.Coulomb(1.0, 1.0), load),), forcing=forcing)

@@ -213,7 +213,7 @@ def _timed_attempt(
         signs = window.signs
         pulls = tuple(belt.load * sign for belt, sign in zip(now.belts, signs, strict=True))
         a = as_quotient(now, signs, pulls, ones, x1, x2)
-        return a - _rate_of_stick(now, mode) if _moves(now) else a
+        return a - rate_of_stick(now, mode) if _moves(now) else a
 
     slopes = [rates(osc, mode, lanes.t, x1, x2)] if rates else []
     for row, row1, c in zip(own.a[1:-1], own.aa[1:-1], own.c[1:-1].tolist(), strict=True):
@@ -234,7 +234,7 @@ def _timed_attempt(
     error = jnp.where(stuck, jnp.where(jnp.isfinite(stages[-1]), 0.0, jnp.inf), error)
     integrals = jax.tree.map(lambda i, *s: i + h * combine(own.a[-1], s), lanes.integrals, *slopes)
     end = clock.at(1.0)
-    rate = jnp.where(stuck, _rate_of_stick(end, mode), stages[-1])
+    rate = jnp.where(stuck, rate_of_stick(end, mode), stages[-1])
     needed = [stages[i] for i in (0, *TIMED_STAGES)]
     return _TimedAttempt(h, y1, y2, stages[-1], rate, lax.stop_gradient(error), integrals, needed)
 
@@ -266,7 +266,7 @@ def _moves(now: Oscillator) -> bool:
     return any(hasattr(belt, "rate") for belt in now.belts)
 
 
-def _rate_of_stick(now: Oscillator, mode: Mode) -> Array:
+def rate_of_stick(now: Oscillator, mode: Mode) -> Array:
     """The acceleration of the belts that are stuck to, over omega; 0 where none is."""
     zero = jnp.zeros_like(mode.codes[0])
     if not _moves(now):
@@ -329,7 +329,7 @@ def _meetings(
     room = LANDS_WITHIN * (atol + rtol * jnp.abs(new.x2)) * h
     start = clock.at(0.0)
     stuck, mode = window.stuck, lanes.mode
-    rate0 = jnp.where(stuck, _rate_of_stick(start, mode), lanes.a)
+    rate0 = jnp.where(stuck, rate_of_stick(start, mode), lanes.a)
     own = _quartic((lanes.x2, rate0), (new.x2, new.rate), new.x1 - lanes.x1, h)
     own = [materialise(k, ones) for k in own]
     found, fuzz = [], GUARD_DOUBT * blur(lanes.t)

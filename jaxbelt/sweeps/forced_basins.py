@@ -11,7 +11,7 @@ import numpy as np
 
 from ..cycles.attractors import RUN, distance
 from ..cycles.clocked import turns_of
-from ..cycles.periodic import PeriodicMotion, nothing_found, periodic
+from ..cycles.periodic import PERIODS_AT_ONCE, PeriodicMotion, nothing_found, periodic
 from ..model.oscillator import Oscillator
 from ..results import Status
 from .datasets import decoded
@@ -58,7 +58,9 @@ def forced_labels(osc: Oscillator, dataset: "xarray.Dataset") -> list[Found]:
 
 def _motion_near(osc: Oscillator, place: np.ndarray, n: int) -> PeriodicMotion:
     """The motion that a run has come to; with the status NO_CONVERGENCE where Newton's method leads
-    to none, or to another."""
+    to none, or to another, or is not asked of so many periods."""
+    if n > PERIODS_AT_ONCE:
+        return nothing_found(osc, turns_of(osc), Status.NO_CONVERGENCE.value)
     motion = periodic(osc, place[4:], periods=n)
     if int(motion.status) == Status.OK:
         size = max(float(np.ptp(place[:2])), float(np.ptp(place[2:4])))

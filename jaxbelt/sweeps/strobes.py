@@ -26,7 +26,7 @@ from jaxtyping import Array
 
 from ..cycles.exponents import BLOCKS
 from ..cycles.settling import way_left
-from ..kernel.clocked import of_lanes
+from ..kernel.clocked import of_lanes, rate_of_stick
 from ..kernel.lanes import Lanes, Observer, Variable, choose, materialise
 from ..model.instants import field_at, guards_at
 from ..model.modes import Mode, mode_acceleration
@@ -133,8 +133,8 @@ class _RunSoFar(eqx.Module):
     """Memory of the observers, arrays [lanes].
 
     strobes: number of the next strobe, counted from t = 0; turns: of the first force from one to
-    the next, 0: the frequencies have no period in common. kind, periods: of the attractor, once
-    known; transient: the time when it was.
+    the next, 0: the frequencies have no period in common. kind, periods, loop_events: of the
+    attractor, once known; transient: the time when it was.
     """
 
     strobes: Array
@@ -144,6 +144,7 @@ class _RunSoFar(eqx.Module):
     growth: _Growth
     kind: Array
     periods: Array
+    loop_events: Array
     transient: Array
 
 
@@ -189,6 +190,7 @@ class Strobed(Observer):
             growth=growth,
             kind=count,
             periods=count,
+            loop_events=count,
             transient=nowhere,
         )
 
@@ -201,58 +203,51 @@ class Strobed(Observer):
         new = take_step(osc, window, ones, lanes, until, rtol, atol)
         stuck = lanes.mode.any_stuck
         h = materialise(new.t - lanes.t, ones)
-        course = Course.of_step(
-            (lanes.x1, lanes.x2, lanes.a), (new.x1, new.x2, new.a), jnp.where(stuck, 0.0, h)
-        )
-        extent = self._extended(seen.extent, lanes, new, stuck, h)
+        ends = [(one.x1, one.x2, _x2_slope(osc, lanes.mode, one)) for one in (lanes, new)]
+        course = Course.of_step(*ends, h)
+        extent = self._extended(seen.extent, lanes.mode, ends, h)
         if self.decides:
-            theta = self._cut(seen, lanes, new, course, stuck, h, ones)
+            theta = self._cut(seen, course, h, ones)
             cut = theta < 1
             new = choose(cut, replace(lanes, h=theta * h), new)
             h = jnp.where(cut, 0.0, h)
-            extent = choose(cut, seen.extent, extent)
-        growth = _grown(osc, seen.growth, lanes, course, stuck, h, ones)
-        due = (h > 0) & (new.t >= strobe) & (seen.turns > 0)
+            # What is known stays until the lane hands it in.
+            extent = choose(cut | (seen.kind != UNDECIDED), seen.extent, extent)
+        growth = _grown(osc, seen.growth, lanes, course, jnp.where(stuck, 0.0, h), ones)
+        due = (h > 0) & (new.t >= strobe) & (seen.turns > 0) & (seen.kind == UNDECIDED)
         memory = self._strobed(replace(seen, extent=extent, growth=growth), new, due, rtol)
         return replace(new, memory=memory)
 
-    def _extended(self, extent: _Extent, lanes: Lanes, new: Lanes, stuck, h) -> _Extent:
-        """The extent with a step: its ends, and extrema that are near one of them."""
+    def _extended(self, extent: _Extent, mode: Mode, ends, h: Array) -> _Extent:
+        """The extent with a step from the first of two ends, (x1, x2, x2'), to the other one: with
+        both, and with extrema that are near to one of them."""
         sticks = tuple(
             total + jnp.where(one, h, 0.0)
-            for total, one in zip(extent.sticks, lanes.mode.stuck, strict=True)
+            for total, one in zip(extent.sticks, mode.stuck, strict=True)
         )
-        extent = replace(extent, sticks=sticks).with_point(new.x1, new.x2)
-        jerk = (new.a - lanes.a) / jnp.where(h > 0, h, 1.0)
-        for one in (lanes, new):
-            way1 = _way_to_zero(one.x2, one.a, h)
-            x1 = one.x1 + way1 * (one.x2 + 0.5 * way1 * one.a)
-            way2 = _way_to_zero(one.a, jerk, h)
-            x2 = one.x2 + way2 * (one.a + 0.5 * way2 * jerk)
-            slips = ~stuck & (h > 0)
-            extent = extent.with_point(jnp.where(slips, x1, one.x1), jnp.where(slips, x2, one.x2))
+        extent = replace(extent, sticks=sticks)
+        jerk = (ends[1][2] - ends[0][2]) / jnp.where(h > 0, h, 1.0)
+        for x1, x2, a in ends:
+            extent = extent.with_point(x1, x2)
+            way = _way_to_zero(x2, a, h)
+            x1 = x1 + way * (x2 + 0.5 * way * a)
+            way = _way_to_zero(a, jerk, h)
+            extent = extent.with_point(x1, x2 + way * (a + 0.5 * way * jerk))
         return extent
 
-    def _cut(
-        self, seen: _RunSoFar, lanes: Lanes, new: Lanes, course: Course, stuck, h, ones
-    ) -> Array:
+    def _cut(self, seen: _RunSoFar, course: Course, h: Array, ones: Array) -> Array:
         """The fraction of a step that ends at its first extremum of x1 or x2; 1 where there is none
         inside, or where none is wanted."""
         theta = jnp.ones_like(h)
-        asked = (seen.repeats.n > 0) & ~stuck & (h > NEAR_EXTREMUM)
-        ends = ((lanes.x2, lanes.a), (new.x2, new.a)), ((lanes.a, None), (new.a, None))
-        for order, ((start, _), (end, _)) in enumerate(ends):
-            values = [start, *(_rate_of(course, order, k / 4) for k in (1, 2, 3)), end]
+        asked = (seen.repeats.n > 0) & (seen.kind == UNDECIDED) & (h > NEAR_EXTREMUM)
+        for order in (0, 1):
+            values = [_rate_of(course, order, k / 4) for k in range(5)]
             for k in reversed(range(4)):
                 a, b = values[k], values[k + 1]
                 crosses = (a * b < 0) & asked
                 root = (k + a / jnp.where(crosses, a - b, 1.0)) / 4
-                inside = (
-                    crosses
-                    & (root * h > NEAR_EXTREMUM * 0.5)
-                    & ((1 - root) * h > NEAR_EXTREMUM * 0.5)
-                )
-                inside = inside & (root > LEAST_CUT) & (root < 1 - LEAST_CUT)
+                near = jnp.minimum(root, 1 - root)
+                inside = crosses & (near * h > 0.5 * NEAR_EXTREMUM) & (near > LEAST_CUT)
                 theta = jnp.where(inside, jnp.minimum(theta, root), theta)
         return materialise(theta, ones)
 
@@ -308,6 +303,7 @@ class Strobed(Observer):
             strobes=jnp.where(due, now + 1, now).astype(now.dtype),
             repeats=choose(due, repeats, known),
             extent=choose(due, kept, seen.extent),
+            loop_events=jnp.where(found, lanes.events - extent.events, seen.loop_events),
             kind=jnp.where(found, PERIODIC, seen.kind).astype(seen.kind.dtype),
             periods=jnp.where(found, known.n, seen.periods).astype(seen.periods.dtype),
             transient=jnp.where(found, lanes.t, seen.transient),
@@ -426,7 +422,7 @@ class ForcedAttractor(Strobed):
             "exponent": jnp.where(open_, exponent, jnp.nan),
             "exponent_error": jnp.where(open_, error, jnp.nan),
             "transient": jnp.where(open_, jnp.nan, seen.transient),
-            "n_events": jnp.where(repeats, lanes.events - extent.events, lanes.events),
+            "n_events": jnp.where(repeats, seen.loop_events, lanes.events),
             "status": jnp.where(lost, Status.NOT_SETTLED.value, lanes.status),
         }
 
@@ -450,6 +446,12 @@ class LargestExponent(Strobed):
             "n_events": lanes.events,
             "status": lanes.status,
         }
+
+
+def _x2_slope(osc: OwnOscillator, mode: Mode, lanes: Lanes) -> Array:
+    """x2' of the lanes in a mode; their `a`, where the mass sticks, is what belts have to hold."""
+    rate = rate_of_stick(at_time(osc, lanes.t), mode)
+    return jnp.where(mode.any_stuck, rate, lanes.a)
 
 
 def _strobe_period(osc: OwnOscillator, turns: Array) -> Array:
@@ -477,10 +479,9 @@ def _rate_of(course: Course, order: int, theta: float) -> Array:
 # --- tangents -------------------------------------------------------------------------------------
 
 
-def _grown(osc, growth: _Growth, lanes: Lanes, course: Course, stuck, h, ones) -> _Growth:
-    """The tangent after a step of size h; the trace of the field is taken into the logarithm."""
+def _grown(osc, growth: _Growth, lanes: Lanes, course: Course, along: Array, ones) -> _Growth:
+    """The tangent after a step along a slip arc; the field's trace is taken into the logarithm."""
     mode, d1, d2, log = lanes.mode, growth.d1, growth.d2, growth.log
-    along = jnp.where(stuck, 0.0, h)
     rates = []
     for k in range(5):
         now = at_time(osc, lanes.t + 0.25 * k * along)
