@@ -204,7 +204,7 @@ class Strobed(Observer):
         stuck = lanes.mode.any_stuck
         h = materialise(new.t - lanes.t, ones)
         ends = [(one.x1, one.x2, _x2_slope(osc, lanes.mode, one)) for one in (lanes, new)]
-        course = Course.of_step(*ends, h)
+        course = Course.of_step(ends[0], ends[1], h)
         extent = self._extended(seen.extent, lanes.mode, ends, h)
         if self.decides:
             theta = self._cut(seen, course, h, ones)
