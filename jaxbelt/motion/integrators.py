@@ -168,7 +168,7 @@ class Adaptive(AbstractIntegrator):
             largest = functools.reduce(jnp.maximum, [jnp.abs(part) for part in y])
             return jnp.where(self.span > 0, largest, 0.0)
 
-        layers = _Layers.of(self.osc, self.mode, field, y)
+        layers = _Layers.of(self.osc, self.mode, field, y, self.rtol + self.atol)
 
         def error_of(start, end, step, error):
             """The error of a step, with what thin layers add, in multiples of the tolerance."""
@@ -218,14 +218,15 @@ class _Layers(eqx.Module):
     thickness: tuple[Array, ...]
 
     @classmethod
-    def of(cls, osc: Oscillator, mode: Mode, field: Field, y: State) -> "_Layers":
+    def of(cls, osc: Oscillator, mode: Mode, field: Field, y: State, least: Array) -> "_Layers":
+        """least: a thickness below which a layer changes nothing that counts."""
         none = jnp.zeros(())
         bends = [_bends(belt, none) for belt in _oscillator_at(osc, y).belts]
         bends = [
             jnp.where(jnp.abs(code) == 1, osc.omega * bend, 0.0)
             for code, bend in zip(mode.codes, bends, strict=True)
         ]
-        thin = [jnp.where(bend > THIN, 1 / bend, jnp.inf) for bend in bends]
+        thin = [jnp.where(bend > THIN, jnp.maximum(1 / bend, least), jnp.inf) for bend in bends]
         return cls(osc, field, tuple(thin))
 
     def asked(self, start: State, end: State, h: Array, rtol: Array) -> tuple[Array, Array]:
