@@ -427,13 +427,17 @@ class Variation:
         if self.units is not None:
             return self
         # Not the first of several: between the ends there may be no possible oscillator.
-        lengths = [own_length(self.oscillator(values)) for values in rows[1:] or rows]
+        ends = rows[1:] or rows
+        lengths = [own_length(self.oscillator(values)) for values in ends]
         one: Any = np if is_concrete(lengths) else jnp
-        return self.in_units(functools.reduce(one.maximum, lengths), rows[0])
+        return self.in_units(functools.reduce(one.maximum, lengths), rows[0], ends)
 
-    def in_units(self, length: Any, values: Any) -> "Variation":
-        """As `in_own_units`, in a given unit of length; those of the parameters are at `values`."""
-        edges = self._may_have_edges(values)
+    def in_units(self, length: Any, values: Any, ends: Sequence[Any] = ()) -> "Variation":
+        """As `in_own_units`, in a given unit of length; those of the parameters are at `values`.
+
+        ends: values at which there are oscillators; none: `values`.
+        """
+        edges = any(self._may_have_edges(possible) for possible in ends or (values,))
 
         def make(*p):
             return in_own_units(self.make(*p), length, edges=edges)
