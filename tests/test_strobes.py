@@ -122,29 +122,32 @@ def test_labels_and_exponents_of_random_oscillators(make):
         assert abs(found.exponent - known) < room or known == -np.inf
 
 
-def free(frequency, damping=0.0, amplitude=0.5, load=0.0):
-    forcing = jb.Harmonic(amplitude, frequency)
-    return jb.Oscillator(damping, (jb.Belt(0.3, jb.Coulomb(1.0, 1.0), load),), forcing=forcing)
+def free(frequency, damping=0.0, load=0.0, velocity=0.3):
+    belt = jb.Belt(velocity, jb.Coulomb(1.0, 1.0), load)
+    return jb.Oscillator(damping, (belt,), forcing=jb.Harmonic(0.5, frequency))
 
 
 @pytest.mark.slow(first=True)
 def test_a_torus_a_response_and_a_mass_that_is_held():
-    """Without friction and damping the motion is a sum of two frequencies; with damping it ends in
+    """A cycle without sticking, pushed at another frequency, is a torus; a belt without load leaves
     the linear response; within the capacity of a belt at rest nothing moves."""
-    osc = {"damping": [0.0, 0.2]}
     found = jb.sweep(
-        lambda damping: free(np.sqrt(2), damping),
-        osc,
-        y0=(1.0, 0.0),
-        t1=4000.0,
+        bernardo,
+        {"frequency": [np.sqrt(5)], "amplitude": [0.02]},
+        y0=(0.5, 0.5),
+        t1=6000.0,
         observe="attractor",
+    ).squeeze()
+    assert jb.decoded(found).kind == "quasiperiodic" and found.status == Status.OK
+    assert abs(found.exponent) < 3 * found.exponent_error < 3e-3
+
+    found = jb.sweep(
+        lambda damping: free(np.sqrt(2), damping), {"damping": [0.2]}, observe="attractor"
     )
-    assert list(jb.decoded(found).kind.values) == ["quasiperiodic", "periodic"]
-    assert abs(found.exponent[0]) < 1e-6
     size = 0.5 / np.hypot(1 - 2, 0.2 * np.sqrt(2))
-    np.testing.assert_allclose(found.x1_max[1], size, rtol=1e-5)
-    np.testing.assert_allclose(found.x2_min[1], -np.sqrt(2) * size, rtol=1e-5)
-    assert found.periods[1] == 1
+    assert jb.decoded(found).kind[0] == "periodic" and found.periods[0] == 1
+    np.testing.assert_allclose(found.x1_max[0], size, rtol=1e-5)
+    np.testing.assert_allclose(found.x2_min[0], -np.sqrt(2) * size, rtol=1e-5)
 
     def held(amplitude):
         belt = jb.Belt(0.0, jb.Coulomb(1.0, 1.0), 1.0)
@@ -153,6 +156,36 @@ def test_a_torus_a_response_and_a_mass_that_is_held():
     found = jb.sweep(held, {"amplitude": [0.5]}, y0=(0.2, 0.0), observe="attractor")
     assert jb.decoded(found).kind[0] == "stuck" and bool(found.sticks[0, 0])
     assert np.isinf(found.stick_duration[0, 0]) and found.x1_max[0] == 0.2
+
+
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("frequency", [0.5, 2.0, np.sqrt(5)])
+def test_what_attracts_nothing_is_no_attractor(frequency):
+    """Without damping, friction of constant size leaves a continuum of motions: at round
+    frequencies each of them repeats."""
+    found = jb.sweep(
+        lambda load: free(frequency, load=load, velocity=50.0),
+        {"load": [0.0, 1.0]},
+        y0=(1.0, 0.0),
+        t1=3000.0,
+        observe="attractor",
+    )
+    assert set(jb.decoded(found).kind.values) == {"undecided"}
+    assert np.all(found.status == Status.NEUTRAL)
+    assert np.all(np.isnan(found.x1_max)) and np.all(found.periods == 0)
+
+
+def test_a_pole_of_the_law_behind_the_boundary_harms_no_tangent():
+    """Conti's law of steepness 10 has a pole at r = -0.1, where x2 = 0 beside a belt of 0.1."""
+
+    def make(velocity):
+        belt = jb.Belt(velocity, jb.Conti(1.0, 0.6, 10.0), 1.0)
+        return jb.Oscillator(0.1, (belt,), forcing=jb.Harmonic(0.5, 0.5))
+
+    found = jb.sweep(make, {"velocity": [-0.1, 0.1]}, y0=(0.3, 0.1), t1=3000.0, observe="lyapunov")
+    motion = jb.find_cycle(make(0.1), (0.3, 0.1))
+    known = np.log(abs(motion.multipliers[0])) / motion.period
+    np.testing.assert_allclose(found.exponent, known, rtol=1e-2)
 
 
 @pytest.mark.slow(first=True)

@@ -54,6 +54,8 @@ TIMED_STRIDE = 0.25
 LEAST_STEPS, PLACING = 8 * ARC_STEPS, 2
 #: Periods of forces have a common multiple if their ratios have denominators up to this.
 RATIOS = 64
+#: Rounding of a ratio of two frequencies.
+RATIO_ROUNDING = 1e-14
 #: A boundary or limit that is passed by less is touched.
 TOUCHES_AGAIN = 1e-8
 #: Newton steps from where a quintic has an extremum to where the motion has it.
@@ -75,7 +77,9 @@ def turns_of(osc: Oscillator) -> int:
     found = np.array([float(one) for one in lax.stop_gradient(frequencies(osc))])
     ratios = [Fraction(one / found[0]).limit_denominator(RATIOS) for one in found.tolist()]
     pairs = zip(ratios, found / found[0], strict=True)
-    common = all(abs(float(ratio) - one) <= 1e-14 * one and ratio > 0 for ratio, one in pairs)
+    common = all(
+        abs(float(ratio) - one) <= RATIO_ROUNDING * one and ratio > 0 for ratio, one in pairs
+    )
     require(common, "osc", "such that all its frequencies have a period in common", found)
     return math.lcm(*(ratio.denominator for ratio in ratios))
 

@@ -636,4 +636,4 @@ def is_same_motion(one: PeriodicMotion, other: PeriodicMotion) -> bool:
     a, b = np.asarray(one.starts), np.asarray(other.starts)
     gaps = [np.max(np.abs(a - np.roll(b, k, axis=0))) for k in range(len(a))]
     size = np.max(np.abs(np.asarray(one.unknowns)[:, :2]))
-    return bool(min(gaps) < SAME_STATE * size)
+    return bool(min(gaps) <= SAME_STATE * size)

@@ -223,18 +223,22 @@ class Course(NamedTuple):
         last = 10 * d - 4 * e + 0.5 * f, -15 * d + 7 * e - f, 6 * d - 3 * e + 0.5 * f
         return cls((p0, v0, 0.5 * a0, *last), None, h)
 
+    def velocity(self, theta) -> tuple[Array, Array]:
+        """x2 within a step, and its derivative by theta."""
+        slopes = [k * c for k, c in enumerate(self.x1)][1:]
+        bends = [k * c for k, c in enumerate(slopes)][1:]
+        h = jnp.where(self.duration > 0, self.duration, 1.0)
+        return _polynomial(slopes, theta) / h, _polynomial(bends, theta) / h
+
     def sample(self, function, osc, mode, theta) -> tuple[Array, Array]:
         """Value of a section, and its derivative by theta."""
         x1 = _polynomial(self.x1, theta)
         slopes = [k * c for k, c in enumerate(self.x1)][1:]
-        bends = [k * c for k, c in enumerate(slopes)][1:]
         if self.x2 is not None:
-            tangents = _polynomial(slopes, theta), jnp.zeros_like(x1)
-            state = x1, self.x2
+            x2, bend = self.x2, jnp.zeros_like(x1)
         else:
-            h = jnp.where(self.duration > 0, self.duration, 1.0)
-            state = x1, _polynomial(slopes, theta) / h
-            tangents = _polynomial(slopes, theta), _polynomial(bends, theta) / h
+            x2, bend = self.velocity(theta)
+        state, tangents = (x1, x2), (_polynomial(slopes, theta), bend)
         value, slope, *_ = jax.jvp(lambda x1, x2: function(osc, mode, x1, x2), state, tangents)
         return value, slope
 

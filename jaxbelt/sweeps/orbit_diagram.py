@@ -177,7 +177,7 @@ def orbit_diagram(
         where: Selects the parameter that varies, as for `scan`; None with a function.
         span: First and last value of the parameter.
         at: Moments at which a cycle has its points, in one loop: `AtExtrema` of "x1" (None) or
-            "x2", an `AtSection`, or `AtEvents`.
+            "x2", an `AtSection`, or `AtEvents`. Of a forced oscillator an `AtPhase` (None).
         y0: Start (x1, x2), or several, [starts, 2]: where attractors coexist, each start shows its
             own.
         rows: Number of values of the parameter, evenly spaced.

@@ -24,26 +24,36 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..cycles.clocked import RATIO_ROUNDING, RATIOS
 from ..cycles.exponents import BLOCKS
 from ..cycles.settling import way_left
 from ..kernel.clocked import of_lanes, rate_of_stick
-from ..kernel.lanes import Lanes, Observer, Variable, choose, materialise
+from ..kernel.lanes import Lanes, Observer, Passage, Variable, choose, materialise
 from ..model.instants import field_at, guards_at
 from ..model.modes import Mode, mode_acceleration
 from ..model.oscillator import at_time, frequencies
 from ..model.own_units import OwnOscillator
 from ..numerics.compiling import where_any
 from ..results import Status
-from .attractor import EQUILIBRIUM, STUCK_FOR_EVER, UNDECIDED
+from .attractor import EQUILIBRIUM, STUCK_FOR_EVER, UNDECIDED, Attractor
 from .moments import LEAST_CUT, Course
 
 #: Kinds of attractors of forced oscillators, in the order of their codes.
 FORCED_KINDS = ("undecided", "equilibrium", "periodic", "stuck", "quasiperiodic", "chaotic")
 PERIODIC, QUASIPERIODIC, CHAOTIC = 2, 4, 5
+#: Code of a motion that is one of a continuum; it becomes undecided at the end.
+FORCED_CONTINUUM = len(FORCED_KINDS)
+#: Results that are those of a cycle without forcing.
+OF_LOOPS_AND_MOTIONS = (
+    "sticks",
+    "period",
+    "stick_duration",
+    "x1_min",
+    "x1_max",
+    "x2_min",
+    "x2_max",
+)
 
-#: Most turns of the first force that are searched for a period that all frequencies have in common,
-#: and how far from whole the turns of the others may be.
-MOST_TURNS, WHOLE = 24, 1e-12
 #: States at two strobes are the same if they differ by less than this, over the size of the motion.
 SAME = 1e-6
 #: Differences below so many tolerances of a step are its errors.
@@ -60,6 +70,8 @@ UNMEASURED = 0.25
 #: Standard errors within which an exponent is zero; per period the error of its computation, and
 #: how large both may be together where a motion is quasiperiodic.
 DEVIATIONS, COMPUTED, RESOLVED = 3.0, 1e-4, 0.01
+#: Growth of a tangent, its logarithm, that is rounding.
+STILL = 1e-9
 #: An extremum is known from a point that is this near in time; steps are cut until there is one.
 NEAR_EXTREMUM = 1e-3
 
@@ -112,21 +124,52 @@ class _Extent(eqx.Module):
 class _Growth(eqx.Module):
     """The tangent and the logarithms of its growth, arrays [lanes].
 
-    d1, d2: the tangent; log: of what is no longer in it, since the present block began, at `since`;
-    began: the time at which the run did; blocks: how many are done, -1 before the first; total,
-    squares: sums of the rates of growth in them, and of their squares; sticks: whether the mass
-    stuck since the first block began.
+    d1, d2: the tangent, of size one when it was last looked at; log: its growth by then; since,
+    before: the time at which the present block began, and `log` there; began: the time at which the
+    run did; blocks: how many are done, -1 before the first; total, squares: sums of the rates of
+    growth in them, and of their squares; sticks: whether the mass stuck since the first began.
     """
 
     d1: Array
     d2: Array
     log: Array
     since: Array
+    before: Array
     began: Array
     blocks: Array
     total: Array
     squares: Array
     sticks: Array
+
+    @classmethod
+    def none(cls, lanes: Lanes) -> "_Growth":
+        zero = jnp.zeros_like(lanes.t)
+        return cls(
+            d1=zero + np.cos(1.0),
+            d2=zero + np.sin(1.0),
+            log=zero,
+            since=lanes.t,
+            before=zero,
+            began=lanes.t,
+            blocks=jnp.full_like(lanes.events, -1),
+            total=zero,
+            squares=zero,
+            sticks=zero > 0,
+        )
+
+    @property
+    def is_still(self) -> Array:
+        """Whether the tangent has kept its size to rounding: the motion attracts nothing."""
+        return jnp.abs(self.log) < STILL
+
+    def exponent(self) -> tuple[Array, Array]:
+        """The largest exponent per unit of time, and its standard error; NaN without blocks."""
+        count = self.blocks.astype(self.total.dtype)
+        safe = jnp.maximum(count, 2.0)  # one block has no spread
+        mean = self.total / safe
+        spread = jnp.maximum(self.squares / safe - mean * mean, 0.0) / (safe - 1)
+        known = count >= 2
+        return jnp.where(known, mean, jnp.nan), jnp.where(known, jnp.sqrt(spread), jnp.nan)
 
 
 class _RunSoFar(eqx.Module):
@@ -148,46 +191,78 @@ class _RunSoFar(eqx.Module):
     transient: Array
 
 
-class Strobed(Observer):
-    """What the observers of this module have in common."""
+class LargestExponent(Observer):
+    """The largest Lyapunov exponent of a forced run, over its last three quarters."""
 
-    #: Whether a run ends as soon as it is known to repeat.
-    decides: ClassVar[bool] = True
+    variables: ClassVar[Mapping[str, Variable]] = {
+        "exponent": Variable("largest Lyapunov exponent per unit of time"),
+        "exponent_error": Variable("its standard error"),
+        "n_events": Variable("number of events", "int32"),
+    }
+
+    def start(self, osc, lanes):
+        return _Growth.none(lanes)
+
+    def follow(self, take_step, osc, window, ones, lanes, t1, rtol, atol):
+        new = take_step(osc, window, ones, lanes, t1, rtol, atol)
+        course = _course_of_step(osc, lanes, new, ones)
+        growth = _grown(osc, lanes.memory, lanes, course, course.duration, ones)
+        return replace(new, memory=growth)
+
+    def watch(self, osc, lanes, passage, ones, t1, tol):
+        return replace(lanes, memory=_grown_past(osc, lanes.memory, lanes, passage, t1))
+
+    def finish(self, osc, lanes):
+        exponent, error = lanes.memory.exponent()
+        good = lanes.status == Status.OK.value
+        return {
+            "exponent": jnp.where(good, exponent, jnp.nan),
+            "exponent_error": jnp.where(good, error, jnp.nan),
+            "n_events": lanes.events,
+            "status": lanes.status,
+        }
+
+
+class ForcedAttractor(Observer):
+    """What a forced run leads to; it ends as soon as that is known.
+
+    - A periodic motion: its states at strobes repeat, all of them, over `CONFIRMED` strobes and two
+      of its periods; no state in between is the same; and what is left of the approach, by the rate
+      at which it shrinks, is below `SAME` of its size.
+    - None of these: one of a continuum of motions, where nothing makes a tangent grow or shrink. It
+      attracts nothing, and the run ends undecided with the status NEUTRAL.
+    - Stuck for ever, or at rest on an edge that pushes back from both sides at all times.
+    - Where no repeat is found until the end of the run its largest exponent decides: it is chaotic
+      where that is more than three standard errors above zero, quasiperiodic where it is zero
+      within these, the mass never sticks and nothing seems to repeat, and else undecided, with the
+      status NOT_SETTLED.
+    """
+
+    variables: ClassVar[Mapping[str, Variable]] = {
+        "kind": Variable("what the run leads to", "int8", meanings=dict(enumerate(FORCED_KINDS))),
+        "periods": Variable("periods of the forcing until the motion repeats", "int32"),
+        **{name: Attractor.variables[name] for name in OF_LOOPS_AND_MOTIONS},
+        "x1_strobe": Variable("displacement at the strobe where it is largest", dimension="length"),
+        "x2_strobe": Variable("velocity at that strobe", dimension="velocity"),
+        "exponent": Variable("largest Lyapunov exponent, where no period was found"),
+        "exponent_error": Variable("its standard error"),
+        "transient": Variable("time at which the attractor was known"),
+        "n_events": Variable("number of events (of a periodic motion: in one period)", "int32"),
+    }
 
     def start(self, osc, lanes):
         zero, count = jnp.zeros_like(lanes.t), jnp.zeros_like(lanes.events)
-        first, *others = frequencies(osc)
-        turns = count
-        for m in reversed(range(1, MOST_TURNS + 1)):
-            whole = jnp.ones_like(lanes.done)
-            for other in others:
-                ratio = m * other / first
-                whole = whole & (jnp.abs(ratio - jnp.round(ratio)) <= WHOLE * m)
-            turns = jnp.where(whole, m, turns)
-        turns = turns.astype(count.dtype)
+        turns = _common_turns(osc, count)
         passed = jnp.floor(lanes.t / _strobe_period(osc, turns) * (1 + 1e-14) + 1e-12)
-        nowhere = zero + jnp.nan
-        start = jnp.full_like(count, -1)
-        repeats = _Repeats(
-            nowhere, nowhere, start, count + FIRST_PATIENCE, count, count, zero, zero + jnp.inf
-        )
-        growth = _Growth(
-            d1=zero + np.cos(1.0),
-            d2=zero + np.sin(1.0),
-            log=zero,
-            since=lanes.t,
-            began=lanes.t,
-            blocks=count - 1,
-            total=zero,
-            squares=zero,
-            sticks=zero > 0,
-        )
+        nowhere, never = zero + jnp.nan, jnp.full_like(count, -1)
+        patience = count + FIRST_PATIENCE
+        repeats = _Repeats(nowhere, nowhere, never, patience, count, count, zero, zero + jnp.inf)
         return _RunSoFar(
             strobes=(passed + 1).astype(count.dtype),
             turns=turns,
             repeats=repeats,
             extent=_Extent.none(lanes, len(osc.belts)),
-            growth=growth,
+            growth=_Growth.none(lanes),
             kind=count,
             periods=count,
             loop_events=count,
@@ -201,33 +276,32 @@ class Strobed(Observer):
         strobe = seen.strobes.astype(lanes.t.dtype) * _strobe_period(osc, seen.turns)
         until = jnp.where(strobe > lanes.t, jnp.minimum(t1, strobe), t1)
         new = take_step(osc, window, ones, lanes, until, rtol, atol)
-        stuck = lanes.mode.any_stuck
-        h = materialise(new.t - lanes.t, ones)
-        ends = [(one.x1, one.x2, _x2_slope(osc, lanes.mode, one)) for one in (lanes, new)]
-        course = Course.of_step(ends[0], ends[1], h)
-        extent = self._extended(seen.extent, lanes.mode, ends, h)
-        if self.decides:
-            theta = self._cut(seen, course, h, ones)
-            cut = theta < 1
-            new = choose(cut, replace(lanes, h=theta * h), new)
-            h = jnp.where(cut, 0.0, h)
-            # What is known stays until the lane hands it in.
-            extent = choose(cut | (seen.kind != UNDECIDED), seen.extent, extent)
-        growth = _grown(osc, seen.growth, lanes, course, jnp.where(stuck, 0.0, h), ones)
-        due = (h > 0) & (new.t >= strobe) & (seen.turns > 0) & (seen.kind == UNDECIDED)
-        memory = self._strobed(replace(seen, extent=extent, growth=growth), new, due, rtol)
-        return replace(new, memory=memory)
+        course = _course_of_step(osc, lanes, new, ones)
+        theta = self._cut(seen, course, ones)
+        cut = theta < 1
+        new = choose(cut, replace(lanes, h=theta * course.duration), new)
+        h = jnp.where(cut, 0.0, course.duration)
+        growth = _grown(osc, seen.growth, lanes, course, h, ones)
+        # What is known stays until the lane hands it in.
+        going_on = seen.kind == UNDECIDED
+        extent = self._extended(seen.extent, lanes, new, course)
+        seen = replace(seen, growth=growth, extent=choose(going_on & ~cut, extent, seen.extent))
+        due = (h > 0) & (new.t >= strobe) & (seen.turns > 0) & going_on
+        return replace(new, memory=self._strobed(seen, new, due, rtol))
 
-    def _extended(self, extent: _Extent, mode: Mode, ends, h: Array) -> _Extent:
-        """The extent with a step from the first of two ends, (x1, x2, x2'), to the other one: with
-        both, and with extrema that are near to one of them."""
+    def _extended(self, extent: _Extent, lanes: Lanes, new: Lanes, course: Course) -> _Extent:
+        """The extent with a step: with both of its ends, and with extrema near to one of them."""
+        h = course.duration
         sticks = tuple(
             total + jnp.where(one, h, 0.0)
-            for total, one in zip(extent.sticks, mode.stuck, strict=True)
+            for total, one in zip(extent.sticks, lanes.mode.stuck, strict=True)
         )
         extent = replace(extent, sticks=sticks)
-        jerk = (ends[1][2] - ends[0][2]) / jnp.where(h > 0, h, 1.0)
-        for x1, x2, a in ends:
+        safe = jnp.where(h > 0, h, 1.0)
+        rates = [course.velocity(jnp.full_like(h, theta))[1] / safe for theta in (0.0, 1.0)]
+        jerk = (rates[1] - rates[0]) / safe
+        for one, a in zip((lanes, new), rates, strict=True):
+            x1, x2 = one.x1, one.x2
             extent = extent.with_point(x1, x2)
             way = _way_to_zero(x2, a, h)
             x1 = x1 + way * (x2 + 0.5 * way * a)
@@ -235,13 +309,14 @@ class Strobed(Observer):
             extent = extent.with_point(x1, x2 + way * (a + 0.5 * way * jerk))
         return extent
 
-    def _cut(self, seen: _RunSoFar, course: Course, h: Array, ones: Array) -> Array:
+    def _cut(self, seen: _RunSoFar, course: Course, ones: Array) -> Array:
         """The fraction of a step that ends at its first extremum of x1 or x2; 1 where there is none
         inside, or where none is wanted."""
+        h = course.duration
         theta = jnp.ones_like(h)
         asked = (seen.repeats.n > 0) & (seen.kind == UNDECIDED) & (h > NEAR_EXTREMUM)
-        for order in (0, 1):
-            values = [_rate_of(course, order, k / 4) for k in range(5)]
+        at = [course.velocity(jnp.full_like(h, k / 4)) for k in range(5)]
+        for values in zip(*at, strict=True):
             for k in reversed(range(4)):
                 a, b = values[k], values[k + 1]
                 crosses = (a * b < 0) & asked
@@ -294,7 +369,7 @@ class Strobed(Observer):
             moved=jnp.where(again | sooner, away, jnp.where(fresh, jnp.inf, known.moved)),
             nearest=jnp.where(fresh, jnp.inf, nearest),
         )
-        found = found & due if self.decides else due & False
+        found = found & due
         empty = _Extent.none(lanes, len(extent.sticks))
         empty = replace(empty, top=(x1, x2))
         kept = choose(fresh & ~found, empty, extent)
@@ -313,83 +388,24 @@ class Strobed(Observer):
 
     def watch(self, osc, lanes, passage, ones, t1, tol):
         seen: _RunSoFar = lanes.memory
-        growth = seen.growth
-
-        def jumped():
-            return of_lanes(
-                _saltation,
-                osc,
-                passage.before,
-                passage.mode,
-                passage.number,
-                (passage.x1, passage.x2, passage.t),
-                (growth.d1, growth.d2),
-            )
-
-        fired = passage.fired & (lanes.run >= 0)
-        before = growth.d1, growth.d2
-        after = where_any(fired, jumped, before)
-        d1, d2 = (jnp.where(fired, a, b) for a, b in zip(after, before, strict=True))
-        growth = replace(growth, d1=d1, d2=d2, sticks=growth.sticks | lanes.mode.any_stuck)
-        growth = _counted(growth, lanes.t, t1)
+        growth = _grown_past(osc, seen.growth, lanes, passage, t1)
         resting = jnp.where(passage.captured, EQUILIBRIUM, seen.kind)
         forever = lanes.status == Status.STUCK_FOREVER.value
         kind = jnp.where(forever & (seen.kind == UNDECIDED), STUCK_FOR_EVER, resting)
+        kind = jnp.where((kind == PERIODIC) & growth.is_still, FORCED_CONTINUUM, kind)
         new = (kind != UNDECIDED) & (seen.kind == UNDECIDED)
         transient = jnp.where(new, lanes.t, seen.transient)
         memory = replace(
             seen, growth=growth, kind=kind.astype(seen.kind.dtype), transient=transient
         )
-        done = lanes.done | (kind != UNDECIDED) if self.decides else lanes.done
-        return replace(lanes, memory=memory, done=done)
-
-    def exponent(self, lanes: Lanes) -> tuple[Array, Array]:
-        """The largest exponent per unit of time, and its standard error; NaN without blocks."""
-        growth = lanes.memory.growth
-        count = growth.blocks.astype(lanes.t.dtype)
-        safe = jnp.maximum(count, 2.0)  # one block has no spread
-        mean = growth.total / safe
-        spread = jnp.maximum(growth.squares / safe - mean * mean, 0.0) / (safe - 1)
-        known = count >= 2
-        return jnp.where(known, mean, jnp.nan), jnp.where(known, jnp.sqrt(spread), jnp.nan)
-
-
-class ForcedAttractor(Strobed):
-    """What a forced run leads to; it ends as soon as that is known.
-
-    - A periodic motion: its states at strobes repeat, all of them, over `CONFIRMED` strobes and two
-      of its periods; no state in between is the same; and what is left of the approach, by the rate
-      at which it shrinks, is below `SAME` of its size.
-    - Stuck for ever, or at rest on an edge that pushes back from both sides at all times.
-    - Where no repeat is found until the end of the run its largest exponent decides: it is chaotic
-      where that is more than three standard errors above zero, quasiperiodic where it is zero
-      within these, the mass never sticks and nothing seems to repeat, and else undecided, with the
-      status NOT_SETTLED.
-    """
-
-    variables: ClassVar[Mapping[str, Variable]] = {
-        "kind": Variable("what the run leads to", "int8", meanings=dict(enumerate(FORCED_KINDS))),
-        "periods": Variable("periods of the forcing until the motion repeats", "int32"),
-        "sticks": Variable("whether the attractor sticks to the belt", "bool", per_belt=True),
-        "period": Variable("period of the motion"),
-        "stick_duration": Variable("time stuck to the belt in one period", per_belt=True),
-        "x1_min": Variable("smallest displacement on the attractor", dimension="length"),
-        "x1_max": Variable("largest displacement on the attractor", dimension="length"),
-        "x2_min": Variable("smallest velocity on the attractor", dimension="velocity"),
-        "x2_max": Variable("largest velocity on the attractor", dimension="velocity"),
-        "x1_strobe": Variable("displacement at the strobe where it is largest", dimension="length"),
-        "x2_strobe": Variable("velocity at that strobe", dimension="velocity"),
-        "exponent": Variable("largest Lyapunov exponent, where no period was found"),
-        "exponent_error": Variable("its standard error"),
-        "transient": Variable("time at which the attractor was known"),
-        "n_events": Variable("number of events (of a periodic motion: in one period)", "int32"),
-    }
+        return replace(lanes, memory=memory, done=lanes.done | (kind != UNDECIDED))
 
     def finish(self, osc, lanes):
         seen: _RunSoFar = lanes.memory
         extent, growth = seen.extent, seen.growth
-        exponent, error = self.exponent(lanes)
-        open_ = (seen.kind == UNDECIDED) & (lanes.status == Status.OK.value)
+        exponent, error = growth.exponent()
+        neutral = (seen.kind == FORCED_CONTINUUM) | (seen.kind == UNDECIDED) & growth.is_still
+        open_ = (seen.kind == UNDECIDED) & (lanes.status == Status.OK.value) & ~neutral
         resolved = open_ & jnp.isfinite(exponent)
         once = _strobe_period(osc, seen.turns)
         doubt = jnp.maximum(DEVIATIONS * error, COMPUTED / once)
@@ -397,7 +413,11 @@ class ForcedAttractor(Strobed):
         even = resolved & (jnp.abs(exponent) <= doubt) & (doubt * once < RESOLVED) & ~growth.sticks
         even = even & (seen.repeats.n == 0)
         kind = jnp.where(chaotic, CHAOTIC, jnp.where(even, QUASIPERIODIC, seen.kind))
+        kind = jnp.where(neutral, UNDECIDED, kind)
         lost = open_ & (kind == UNDECIDED)
+        status = jnp.where(lost, Status.NOT_SETTLED.value, lanes.status)
+        neutral = neutral & (lanes.status == Status.OK.value)
+        status = jnp.where(neutral, Status.NEUTRAL.value, status)
         period = seen.periods.astype(lanes.t.dtype) * once
         repeats, holds = kind == PERIODIC, kind == STUCK_FOR_EVER
         rests = holds | (kind == EQUILIBRIUM)
@@ -421,37 +441,35 @@ class ForcedAttractor(Strobed):
             "x2_strobe": of_attractor(extent.top[1], lanes.x2),
             "exponent": jnp.where(open_, exponent, jnp.nan),
             "exponent_error": jnp.where(open_, error, jnp.nan),
-            "transient": jnp.where(open_, jnp.nan, seen.transient),
+            "transient": of_attractor(seen.transient, seen.transient),
             "n_events": jnp.where(repeats, seen.loop_events, lanes.events),
-            "status": jnp.where(lost, Status.NOT_SETTLED.value, lanes.status),
+            "status": status,
         }
 
 
-class LargestExponent(Strobed):
-    """The largest Lyapunov exponent of a forced run, over its last three quarters."""
-
-    decides: ClassVar[bool] = False
-    variables: ClassVar[Mapping[str, Variable]] = {
-        "exponent": Variable("largest Lyapunov exponent per unit of time"),
-        "exponent_error": Variable("its standard error"),
-        "n_events": Variable("number of events", "int32"),
-    }
-
-    def finish(self, osc, lanes):
-        exponent, error = self.exponent(lanes)
-        good = lanes.status == Status.OK.value
-        return {
-            "exponent": jnp.where(good, exponent, jnp.nan),
-            "exponent_error": jnp.where(good, error, jnp.nan),
-            "n_events": lanes.events,
-            "status": lanes.status,
-        }
+def _course_of_step(osc: OwnOscillator, lanes: Lanes, new: Lanes, ones: Array) -> Course:
+    """The way of lanes in a step."""
+    ends = [(one.x1, one.x2, _x2_slope(osc, lanes.mode, one)) for one in (lanes, new)]
+    return Course.of_step(ends[0], ends[1], materialise(new.t - lanes.t, ones))
 
 
 def _x2_slope(osc: OwnOscillator, mode: Mode, lanes: Lanes) -> Array:
     """x2' of the lanes in a mode; their `a`, where the mass sticks, is what belts have to hold."""
     rate = rate_of_stick(at_time(osc, lanes.t), mode)
     return jnp.where(mode.any_stuck, rate, lanes.a)
+
+
+def _common_turns(osc: OwnOscillator, none: Array) -> Array:
+    """As `turns_of`, of each lane, as numbers like `none`, its 0 where there is no such period."""
+    first, *others = frequencies(osc)
+    turns = none
+    for m in reversed(range(1, RATIOS + 1)):
+        whole = jnp.ones(none.shape, bool)
+        for other in others:
+            ratio = jnp.abs(m * other / first)
+            whole = whole & (jnp.abs(ratio - jnp.round(ratio)) <= RATIO_ROUNDING * ratio)
+        turns = jnp.where(whole, m, turns)
+    return turns.astype(none.dtype)
 
 
 def _strobe_period(osc: OwnOscillator, turns: Array) -> Array:
@@ -466,26 +484,20 @@ def _way_to_zero(value: Array, slope: Array, h: Array) -> Array:
     return jnp.where((slope != 0) & (jnp.abs(way) <= NEAR_EXTREMUM) & (h > 0), way, 0.0)
 
 
-def _rate_of(course: Course, order: int, theta: float) -> Array:
-    """x2, or x2' for order 1, at a part of a step."""
-    total = jnp.zeros_like(course.duration)
-    for k in reversed(range(order + 1, len(course.x1))):
-        factor = k if order == 0 else k * (k - 1)
-        total = total * theta + factor * course.x1[k]
-    h = jnp.where(course.duration > 0, course.duration, 1.0)
-    return total / (h if order == 0 else h * h)
-
-
 # --- tangents -------------------------------------------------------------------------------------
 
 
-def _grown(osc, growth: _Growth, lanes: Lanes, course: Course, along: Array, ones) -> _Growth:
-    """The tangent after a step along a slip arc; the field's trace is taken into the logarithm."""
+def _grown(osc, growth: _Growth, lanes: Lanes, course: Course, h: Array, ones) -> _Growth:
+    """The tangent after a step of size h; along a slip arc the trace of the field is taken into the
+    logarithm."""
     mode, d1, d2, log = lanes.mode, growth.d1, growth.d2, growth.log
+    moves = ~mode.any_stuck & (h > 0)
+    along = jnp.where(moves, h, 0.0)
     rates = []
     for k in range(5):
         now = at_time(osc, lanes.t + 0.25 * k * along)
-        x2 = _rate_of(course, 0, 0.25 * k) if k else lanes.x2
+        # The law may have a pole where the way of a lane that stands would be.
+        x2 = jnp.where(moves, course.velocity(jnp.full_like(h, 0.25 * k))[0], lanes.x2)
 
         def field(x2, now=now):
             return mode_acceleration(now, mode, lanes.x1, x2)
@@ -507,6 +519,22 @@ def _grown(osc, growth: _Growth, lanes: Lanes, course: Course, along: Array, one
     return replace(growth, d1=materialise(d1, ones), d2=materialise(d2, ones), log=log)
 
 
+def _grown_past(osc, growth: _Growth, lanes: Lanes, passage: Passage, t1: Array) -> _Growth:
+    """The tangent behind the events that were passed, and its growth until now."""
+    before = growth.d1, growth.d2
+
+    def jumped():
+        state = passage.x1, passage.x2, passage.t
+        guards = passage.before, passage.mode, passage.number
+        return of_lanes(_saltation, osc, *guards, state, before)
+
+    fired = passage.fired & (lanes.run >= 0)
+    after = where_any(fired, jumped, before)
+    d1, d2 = (jnp.where(fired, a, b) for a, b in zip(after, before, strict=True))
+    growth = replace(growth, d1=d1, d2=d2, sticks=growth.sticks | lanes.mode.any_stuck)
+    return _counted(growth, lanes.t, t1)
+
+
 def _counted(growth: _Growth, t: Array, t1: Array) -> _Growth:
     """The tangent of size one, its growth in the logarithm, and the block ended that is over."""
     size = jnp.hypot(growth.d1, growth.d2)
@@ -517,13 +545,14 @@ def _counted(growth: _Growth, t: Array, t1: Array) -> _Growth:
     over = t >= first + (growth.blocks + 1).astype(t.dtype) * length - 1e-9 * length
     elapsed = t - growth.since
     counts = over & (growth.blocks >= 0) & (elapsed > 0)
-    rate = jnp.where(counts, log / jnp.where(counts, elapsed, 1.0), 0.0)
+    rate = jnp.where(counts, (log - growth.before) / jnp.where(counts, elapsed, 1.0), 0.0)
     return replace(
         growth,
         d1=growth.d1 / size,
         d2=growth.d2 / size,
-        log=jnp.where(over, 0.0, log),
+        log=log,
         since=jnp.where(over, t, growth.since),
+        before=jnp.where(over, log, growth.before),
         blocks=jnp.where(over & (growth.blocks < BLOCKS), growth.blocks + 1, growth.blocks).astype(
             growth.blocks.dtype
         ),
