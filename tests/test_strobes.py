@@ -175,19 +175,6 @@ def test_what_attracts_nothing_is_no_attractor(frequency):
     assert np.all(np.isnan(found.x1_max)) and np.all(found.periods == 0)
 
 
-def test_a_pole_of_the_law_behind_the_boundary_harms_no_tangent():
-    """Conti's law of steepness 10 has a pole at r = -0.1, where x2 = 0 beside a belt of 0.1."""
-
-    def make(velocity):
-        belt = jb.Belt(velocity, jb.Conti(1.0, 0.6, 10.0), 1.0)
-        return jb.Oscillator(0.1, (belt,), forcing=jb.Harmonic(0.5, 0.5))
-
-    found = jb.sweep(make, {"velocity": [-0.1, 0.1]}, y0=(0.3, 0.1), t1=3000.0, observe="lyapunov")
-    motion = jb.find_cycle(make(0.1), (0.3, 0.1))
-    known = np.log(abs(motion.multipliers[0])) / motion.period
-    np.testing.assert_allclose(found.exponent, known, rtol=1e-2)
-
-
 @pytest.mark.slow(first=True)
 def test_periods_are_those_that_all_frequencies_have_in_common():
     def make(ratio):

@@ -491,13 +491,11 @@ def _grown(osc, growth: _Growth, lanes: Lanes, course: Course, h: Array, ones) -
     """The tangent after a step of size h; along a slip arc the trace of the field is taken into the
     logarithm."""
     mode, d1, d2, log = lanes.mode, growth.d1, growth.d2, growth.log
-    moves = ~mode.any_stuck & (h > 0)
-    along = jnp.where(moves, h, 0.0)
+    along = jnp.where(mode.any_stuck, 0.0, h)
     rates = []
     for k in range(5):
         now = at_time(osc, lanes.t + 0.25 * k * along)
-        # The law may have a pole where the way of a lane that stands would be.
-        x2 = jnp.where(moves, course.velocity(jnp.full_like(h, 0.25 * k))[0], lanes.x2)
+        x2 = course.velocity(jnp.full_like(h, 0.25 * k))[0]
 
         def field(x2, now=now):
             return mode_acceleration(now, mode, lanes.x1, x2)
