@@ -273,6 +273,40 @@ def test_integrals_keep_the_balance_of_energy(velocity, end):
     np.testing.assert_allclose(run.friction[0] - 0.1 * run.square[0], gained, atol=3e-8)
 
 
+@dataclasses.dataclass(frozen=True)
+class Square:
+    """The integral of x1 squared."""
+
+    at = (jb.AtEvents(),)
+
+    def init(self, osc, x1, x2):
+        return jnp.zeros(())
+
+    def rates(self, osc, motion):
+        return motion.x1**2
+
+    def update(self, state, event):
+        return event.integrals
+
+    def finish(self, state, end):
+        return {"square": end.integrals}
+
+
+@pytest.mark.slow(first=True)
+def test_integrals_where_a_stick_phase_ends_far_back_in_its_step():
+    """Against samples of `simulate`, by the trapezoidal rule; the mass sticks for 0.035 at 25.2."""
+
+    def make(amplitude):
+        belt = jb.Belt(0.3, jb.Conti(1.0, 0.6, 10.0), 1.0)
+        return jb.Oscillator(0.1, (belt,), forcing=jb.Harmonic(amplitude, 1.2, 0.3))
+
+    tight = {"rtol": 1e-10, "atol": 1e-10}
+    run = jb.sweep(make, {"amplitude": [1.0]}, y0=(0.5, 0.1), t1=30.0, observe=Square(), **tight)
+    ts = np.linspace(0.0, 30.0, 60_001)
+    x1 = np.asarray(jb.simulate(make(1.0), (0.5, 0.1), 30.0, ts=ts, **tight).ys)[:, 0]
+    np.testing.assert_allclose(run.square[0], np.trapezoid(x1**2, ts), atol=1e-7)
+
+
 @pytest.mark.parametrize(
     "observe, t1, message",
     [
