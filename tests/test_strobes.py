@@ -322,6 +322,16 @@ def test_what_is_for_forced_oscillators_only(observe, t1, message):
         jb.sweep(make, {"velocity": [0.1]}, t1=t1, observe=observe)
 
 
+def test_pictures_and_shares_of_forced_sweeps(labels):
+    """A picture of stick durations has those of periodic motions; shares are for loops."""
+    lines = jb.plot_sweep(labels, "stick_duration").lines
+    sticks = labels.stick_duration.values[:, 0]
+    np.testing.assert_array_equal(lines[0].get_ydata(), sticks)
+    assert np.sum(np.isfinite(sticks)) == 6
+    with pytest.raises(ValueError, match="dataset must be of oscillators without a clock"):
+        jb.attractors(labels.rename(frequency="x1"))
+
+
 def test_an_exponent_needs_an_end_and_labels_no_audit():
     with pytest.raises(ValueError, match="t1 must be given"):
         jb.sweep(bernardo, {"frequency": [1.7]}, observe="lyapunov")

@@ -38,7 +38,8 @@ from .style import (
 COUNTED = ("belt", "attractor")
 #: Axes of datasets along which starts differ.
 AXES_OF_STARTS = ("x1", "x2")
-#: Variables that are 0 for an attractor other than a cycle, though it has no loop.
+#: Variables that are 0 for an attractor other than a cycle or a periodic motion, though it has no
+#: loop.
 OF_LOOPS = ("stick_duration", "d_stick_duration")
 
 
@@ -139,7 +140,7 @@ def _numbers_of_runs(dataset: xr.Dataset, variable: str) -> xr.DataArray:
     """A variable as floats, NaN where the run is not done or leads to no cycle."""
     values = dataset[variable].astype(float)
     if variable.startswith(OF_LOOPS) and "kind" in dataset:
-        values = values.where(decoded(dataset[["kind"]]).kind == "cycle")
+        values = values.where(decoded(dataset[["kind"]]).kind.isin(["cycle", "periodic"]))
     return values if "status" not in dataset else values.where(dataset.status >= 0)
 
 

@@ -62,6 +62,10 @@ def attractors(
     """
     check_dataset(dataset)
     require("kind" in dataset, "dataset", 'that of sweep(..., observe="attractor")', "one without")
+    forced = "periods" in dataset
+    require(
+        not forced, "dataset", "of oscillators without a clock", "one of forced ones: jb.basins"
+    )
     missing = int(np.sum(dataset["kind"].values < UNDECIDED))
     require(
         not missing, "dataset", "of a sweep that is done", f"one with {missing:,} runs not done"
