@@ -1,5 +1,6 @@
 """The command line, `jaxbelt reproduce`, `jaxbelt simulate` and the rest."""
 
+from dataclasses import fields
 from typing import Annotated, Any
 
 import typer
@@ -11,7 +12,8 @@ from .commands.basins import basins
 from .commands.cache import cache
 from .commands.diagram import diagram
 from .commands.map import region_map
-from .commands.options import CLASSES, plain_errors
+from .commands.options import CLASSES, Description, plain_errors
+from .commands.orbits import orbits
 from .commands.reproduce import reproduce
 from .commands.simulate import simulate
 from .commands.sweep import sweep
@@ -35,12 +37,24 @@ class Command(TyperCommand):
                 words = [name] if name.startswith("--") else [one for one in given if name in one]
                 error.__dict__["possibilities"] = self._meant(words[0] if words else name)
             raise
-        source = ctx.get_parameter_source("system")
-        if ctx.params.get("belt") and source is not None and source.name == "COMMANDLINE":
-            with plain_errors():
+        with plain_errors():
+            if ctx.params.get("belt") and self._given(ctx, ["system"]):
                 system = ctx.params["system"]
                 raise ValueError(f"with --belt no class must be described, got --class {system}")
+            describing = [field.name for field in fields(Description) if field.name != "file"]
+            if ctx.params.get("file") and (given := self._given(ctx, describing)):
+                came = ", ".join(given)
+                raise ValueError(f"with --file nothing else must be described, got {came}")
         return rest
+
+    def _given(self, ctx: Any, names: list[str]) -> list[str]:
+        """The options of these parameters that stand on the command line."""
+        sources = {one: ctx.get_parameter_source(one.name) for one in self.params}
+        return [
+            one.opts[0]
+            for one, source in sources.items()
+            if one.name in names and source is not None and source.name == "COMMANDLINE"
+        ]
 
     def _meant(self, word: str) -> list[str]:
         """Similar options, compared without dashes, which all options have."""
@@ -77,7 +91,8 @@ def main(
     """Belt-driven dry-friction oscillators: simulation and bifurcation analysis.
 
     All quantities are dimensionless: displacement x1, velocity x2, time tau = omega t, belt
-    velocities nu0, nu1. **jaxbelt COMMAND --help** explains a command.
+    velocities nu0, nu1; or in SI units, where a file describes a machine. **jaxbelt COMMAND
+    --help** explains a command.
     """
 
 
@@ -85,6 +100,7 @@ for name, command in (
     ("reproduce", reproduce),
     ("simulate", simulate),
     ("diagram", diagram),
+    ("orbits", orbits),
     ("map", region_map),
     ("sweep", sweep),
     ("basins", basins),

@@ -418,7 +418,7 @@ def _fitted(fit: Fit, machine: Machine | Units) -> "xarray.Dataset":
     check_machine(fit, machine)
     units, table = units_of(machine), fit.table()
     known = [
-        *(_unit_of(name, fit.oscillator, units) for name in fit.names),
+        *(unit_of(name, fit.oscillator, units) for name in fit.names),
         *_units_of_start(units),
     ]
     symbols, sizes = zip(*known, strict=True)
@@ -442,7 +442,7 @@ def _fitted(fit: Fit, machine: Machine | Units) -> "xarray.Dataset":
     return xarray.Dataset(found, coordinates, attrs)
 
 
-def _unit_of(name: str, osc: Oscillator, units: Units) -> tuple[str, float]:
+def unit_of(name: str, osc: Oscillator, units: Units) -> tuple[str, float]:
     """Unit of a parameter of a fit, and the value of 1 in it; tied parameters must have the
     same."""
     found = set()
@@ -552,7 +552,7 @@ def units_along(
     require(int(belt) < belts, "machine", f"of a belt {belt}, of which result is", f"{belts} belts")
     known = "the velocity, load, edges or law of a belt, a force, or the damping"
     require(name != "omega", "result", f"along {known}", "one along omega, 1 in every machine")
-    return units, _unit_of(name, osc, units)
+    return units, unit_of(name, osc, units)
 
 
 def _dataset(dataset: "xarray.Dataset", machine: Any) -> "xarray.Dataset":

@@ -17,9 +17,10 @@ from typer.testing import CliRunner
 import jaxbelt as jb
 from jaxbelt import paper as reproduce
 from jaxbelt.cli import app
-from jaxbelt.commands.map import write_table
-from jaxbelt.commands.options import Description, parse_belt, tolerances
+from jaxbelt.commands.belts import parse_belt
+from jaxbelt.commands.options import Description, tolerances
 from jaxbelt.commands.sweep import VARIABLES
+from jaxbelt.commands.tables import write_table
 from jaxbelt.model.parameters import names_of
 from jaxbelt.sweeps.question import Question
 from jaxbelt.tables import table_of

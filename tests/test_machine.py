@@ -15,7 +15,7 @@ from laws import Lorentz
 import jaxbelt as jb
 from jaxbelt.bifurcations.diagrams import Branch
 from jaxbelt.model.parameters import names_of
-from jaxbelt.si import _unit_of
+from jaxbelt.si import unit_of
 
 MASS, STIFFNESS, DAMPING = 0.5, 2000.0, 1.0
 
@@ -666,7 +666,7 @@ def test_units_of_the_numbers_of_forces():
         ("belts[0].velocity.amplitude", 0.01, "m s-1"),
         ("belts[0].velocity.frequency", 60.0, "rad s-1"),
     ):
-        unit, one = _unit_of(name, osc, m.units)
+        unit, one = unit_of(name, osc, m.units)
         assert unit == symbol and float(leaves[name]) * one == pytest.approx(size, rel=1e-14)
 
 

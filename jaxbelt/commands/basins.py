@@ -69,6 +69,7 @@ def basins(
         check_range("x2", x2)
         written = outputs(out, ".png", ".csv", ".nc")
         described.check()
+        described.refuse_machine("basins")
         turn_on_float64()
         osc = described.oscillator()
         import jax

@@ -1,6 +1,7 @@
 """`jaxbelt diagram`: equilibria, cycles and bifurcation points along a parameter."""
 
-import csv
+import operator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -9,29 +10,30 @@ import typer
 
 import jaxbelt as jb
 
-from ..spelling import did_you_mean
 from .options import (
     Description,
     Interval,
     Json,
     Out,
+    Start,
     as_json_value,
     check_range,
     describes,
     from_to,
     make_console,
-    names_in_words,
     outputs,
     plain_errors,
     say,
     turn_on_float64,
 )
+from .tables import in_columns, with_unit, write_columns
 
 #: Arguments of classes that may be varied besides velocities: an edge of two belts, or of one.
 EDGES = ("sigma", "sigma0", "sigma1")
 #: Quantities that a diagram can show.
 DRAWABLE = ("amplitude", "x1", "x2", "period")
-POINT_COLUMNS = ("value", "kind", "belts", "type", "error", "status")
+#: Fields of a branch that are columns of the table.
+FIELDS = ("stable", "x1_min", "x1_max", "x2_min", "x2_max", "period", "multiplier")
 
 
 @describes()
@@ -45,7 +47,11 @@ def diagram(
             "belts[1].friction.steepness.",
         ),
     ] = "nu0",
-    span: Annotated[Interval, from_to("Its first and last value.")] = (-0.7, 0.7),
+    span: Annotated[Interval, from_to("Its first and last value; of a machine in its SI unit.")] = (
+        -0.7,
+        0.7,
+    ),
+    start: Start = None,
     rows: Annotated[int, typer.Option(help="About how many values are computed.")] = 160,
     quantity: Annotated[
         str | None,
@@ -68,6 +74,10 @@ def diagram(
     - **OUT_points.csv**: value, kind, belts, type (such as subcritical; "" where the kind has only
       one), error (a bound), status of every bifurcation point.
 
+    With forcing it is the branch of one periodic motion, stable and unstable, and what leaves it at
+    period doublings: the motion that **--start** leads to in the middle of the span, or one that is
+    found. Of a machine all is in SI units.
+
     An oscillator is described as for **simulate**; the parameter that varies needs no value. Takes
     some ten seconds, mostly to compile; longer with contact edges.
 
@@ -78,6 +88,10 @@ def diagram(
     - jaxbelt diagram --nu0 -0.2 --nu1 0.35 --vary zeta --span 0 1.5 --quantity x1
 
     - jaxbelt diagram --class c --nu0 0.35 --nu1 -0.25 --vary sigma --span -1 1
+
+    - jaxbelt diagram --class a --force 0.5,1.2 --vary "forcing[0].frequency" --span 0.8 1.6
+
+    - jaxbelt diagram --file machine.toml --vary "belts[0].velocity" --span 0.05 0.3
     """
     console = make_console()
     with plain_errors():
@@ -88,78 +102,89 @@ def diagram(
         check_range("span", span)
         written = outputs(out, ".png", ".csv", "_points.csv")
         described.check(**({parameter: span[0]} if parameter in EDGES else {}))
-        paths, short = described.parameters(), described.short_names
-        if parameter not in (*short, *paths):
-            known, meant = names_in_words(short, paths), did_you_mean(parameter, (*short, *paths))
-            raise ValueError(f"vary must be {known}, got {parameter}{meant}")
+        described.check_parameter(parameter)
         turn_on_float64()
-
-        def along(p):
-            return described.oscillator(**{parameter: p})
-
+        given = None if start is None else described.start(start)
+        path = described.path_along(parameter, span)
+        found = jb.bifurcation_diagram(*path, start=given, rows=rows)
         if parameter in EDGES:
-            found = jb.bifurcation_diagram(along, span=span, rows=rows)
             found = replace(found, name=parameter)
-        else:
-            osc = described.oscillator()
-            found = jb.bifurcation_diagram(osc, _where(osc, paths[parameter]), span, rows=rows)
         from ..plotting.diagrams import plot_diagram
         from ..plotting.style import draw_key, journal_figure, journal_style, save
 
         with journal_style():
             figure = journal_figure(7.2, 4.2)
-            plot_diagram(found, figure.subplots(), quantity=quantity)
+            if described.machine:
+                jb.plot_in_si(found, described.machine, figure.subplots(), quantity=quantity)
+            else:
+                plot_diagram(found, figure.subplots(), quantity=quantity)
             draw_key(figure)
             out.parent.mkdir(parents=True, exist_ok=True)
             save(figure, written[0])
-        write_branches(found, written[1])
-        write_points(found.points, written[2])
-    regions = [{"from": a, "to": b, "name": name} for a, b, name in found.regions]
-    data = {"parameter": found.name, "points": _points_as_data(found.points), "regions": regions}
+        unit = described.unit(parameter)
+        write_columns(branches_of(found, described.machine), written[1])
+        points = points_of(found.points, *unit)
+        write_columns(points, written[2])
+    symbol, size = unit
+    regions = [{"from": a * size, "to": b * size, "name": name} for a, b, name in found.regions]
+    rows_of_points = _as_rows(points)
+    data = {"parameter": found.name, "points": rows_of_points, "regions": regions}
     lines = [repr(found), *map(repr, found.points)]
+    if described.machine:
+        data |= {"parameter": parameter, "unit": symbol}
+        counts = f"{len(found.points)} points, {len(found.branches)} branches"
+        lines = [f"{with_unit(parameter, symbol)} from {span[0]:g} to {span[1]:g}: {counts}"]
+        lines += [
+            ", ".join(f"{k} {v}" for k, v in row.items() if v != "") for row in rows_of_points
+        ]
     say(console, lines, written, as_json=as_json, data=data)
 
 
-def _where(osc: "jb.Oscillator", path: str) -> Any:
-    """Function that selects the parameter with this path."""
-    import jax
+def points_of(points: "tuple[jb.BifurcationPoint, ...]", unit: str, size: float) -> dict[str, Any]:
+    """Columns value, kind, belts, type, error and status, a row for each bifurcation point.
 
-    from ..model.parameters import names_of
-
-    place = names_of(osc).index(path)
-    return lambda osc: jax.tree.leaves(osc)[place]
-
-
-def write_points(points, path: Path) -> None:
-    """Writes value, kind, belts, type, error and status, one row for each bifurcation point."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(POINT_COLUMNS)
-        writer.writerows(map(_in_columns, points))
+    unit: that of the parameter, and size its size.
+    """
+    return {
+        with_unit("value", unit): [float(point.value) * size for point in points],
+        "kind": [point.kind for point in points],
+        "belts": [" ".join(map(str, point.condition.belts_concerned)) for point in points],
+        "type": [point.type for point in points],
+        with_unit("error", unit): [float(point.error) * size for point in points],
+        "status": [jb.Status(int(point.status)).name for point in points],
+    }
 
 
-def _in_columns(point: "jb.BifurcationPoint") -> list[Any]:
-    belts = " ".join(map(str, point.condition.belts_concerned))
-    status = jb.Status(int(point.status)).name
-    return [float(point.value), point.kind, belts, point.type, float(point.error), status]
+def _as_rows(columns: dict[str, list[Any]]) -> list[dict[str, Any]]:
+    """Rows of a table of points, for JSON."""
+    rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+    return [
+        {k: as_json_value(v) if isinstance(v, float) else v for k, v in row.items()} for row in rows
+    ]
 
 
-def _points_as_data(points) -> list[dict[str, Any]]:
-    """Rows of `write_points`, for JSON."""
-    rows = [dict(zip(POINT_COLUMNS, _in_columns(point), strict=True)) for point in points]
-    return [row | {name: as_json_value(row[name]) for name in ("value", "error")} for row in rows]
+def branches_of(found: "jb.BifurcationDiagram", machine: "jb.Machine | None") -> dict[str, Any]:
+    """Columns of the branches, a row for each equilibrium or cycle; see `jaxbelt diagram --help`.
 
+    With a machine they are in SI units.
+    """
+    belts, branches = range(len(found.oscillator.belts)), found.branches
+    if machine:
+        rows = jb.in_si(found, machine)
+        names = ["branch", "kind", "value", *FIELDS, *(f"stick_duration_{i}" for i in belts)]
+        columns = in_columns(rows.isel(row=rows.branch.values >= 0), names)
+        return {name.replace("duration_", "duration"): one for name, one in columns.items()}
 
-def write_branches(found: "jb.BifurcationDiagram", path: Path) -> None:
-    """Writes one row for each equilibrium or cycle, see `jaxbelt diagram --help`."""
-    fields = ("values", "stable", "x1_min", "x1_max", "x2_min", "x2_max", "period", "multiplier")
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        belts = range(len(found.oscillator.belts))
-        names = [f"stick_duration{i}" for i in belts]
-        writer.writerow(["branch", "kind", "value", *fields[1:], *names])
-        for number, branch in enumerate(found.branches):
-            columns = [getattr(branch, name).tolist() for name in fields]
-            sticks = branch.stick_durations.tolist()
-            for row, durations in zip(zip(*columns, strict=True), sticks, strict=True):
-                writer.writerow([number, branch.kind, *row, *durations])
+    def joined(column: Callable[[Any], Any]) -> list[Any]:
+        return [entry for branch in branches for entry in column(branch).tolist()]
+
+    counted = [
+        (number, branch.kind) for number, branch in enumerate(branches) for _ in branch.values
+    ]
+    return {
+        "branch": [number for number, _ in counted],
+        "kind": [kind for _, kind in counted],
+        "value": joined(lambda branch: branch.values),
+        **{name: joined(operator.attrgetter(name)) for name in FIELDS},
+        **{f"stick_duration{i}": joined(lambda one, i=i: one.stick_durations[:, i]) for i in belts},
+    }

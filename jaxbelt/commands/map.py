@@ -2,7 +2,7 @@
 
 import csv
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -22,6 +22,7 @@ from .options import (
     say,
     turn_on_float64,
 )
+from .tables import write_table
 
 
 @describes()
@@ -65,6 +66,7 @@ def region_map(
     console = make_console()
     with plain_errors():
         described.check_axes(axes)
+        described.refuse_machine("map")
         if cells < 2:
             raise ValueError(f"cells must be at least 2, got {cells}")
         check_range("p", p)
@@ -115,8 +117,3 @@ def write_cells(found: "jb.RegionMap", path: Path) -> None:
         for p, names, lines in zip(first, found.label, found.on_line, strict=True):
             cells = zip(second, names, lines, strict=True)
             writer.writerows([p, q, name, words[name], int(line)] for q, name, line in cells)
-
-
-def write_table(table: Any, path: Path) -> None:
-    """Writes a table of a result, every number to the last digit."""
-    table.to_csv(path, index=False, na_rep="nan")

@@ -27,6 +27,8 @@ from rich.console import Console
 import jaxbelt as jb
 
 from ..spelling import did_you_mean
+from .belts import LAWS, parse_belt, parts_of_belt, parts_of_force
+from .files import FromFile, changed, oscillator_of, read
 
 #: Arguments of the four classes of the paper, and their defaults.
 CLASSES = {
@@ -34,12 +36,6 @@ CLASSES = {
     "b": {"nu0": 0.45, "nu1": 0.35},
     "c": {"nu0": 0.2, "nu1": 0.4, "sigma": 0.8},
     "d": {"nu0": 0.2, "nu1": 0.4, "sigma0": 0.5, "sigma1": 1.0},
-}
-#: Friction laws by name: their classes, and the defaults of their arguments.
-LAWS: dict[str, tuple[str, dict[str, float | None]]] = {
-    "conti": ("Conti", {"static": 1.0, "residual": 0.6, "steepness": 10.0, "quadratic": 0.0}),
-    "coulomb": ("Coulomb", {"static": None, "kinetic": None}),
-    "stribeck": ("Stribeck", {"static": None, "kinetic": None, "stribeck_velocity": None}),
 }
 
 
@@ -231,14 +227,29 @@ Forces = Annotated[
         show_default="none",
     ),
 ]
+File = Annotated[
+    Path | None,
+    typer.Option(
+        help="A TOML file that describes the oscillator, or a machine in SI units, instead of all "
+        "these options: see **jaxbelt simulate --help**.",
+        show_default="none",
+    ),
+]
 Damping = Annotated[float, typer.Option(help="zeta = c / sqrt(k m).")]
 Omega = Annotated[float, typer.Option(help="sqrt(k / m).")]
 Json = Annotated[
     bool, typer.Option("--json", help="Print the results as one line of JSON, for scripts.")
 ]
 Interval = tuple[float, float]
+#: The start where none is given, dimensionless.
+START = (3.0, 0.0)
 Start = Annotated[
-    Interval, typer.Option(metavar="X1 X2", help="Displacement x1 and velocity x2 at tau = 0.")
+    Interval | None,
+    typer.Option(
+        metavar="X1 X2",
+        help="Displacement x1 and velocity x2 at tau = 0; of a machine in m and m/s.",
+        show_default="3.0 0.0, dimensionless",
+    ),
 ]
 Out = Annotated[
     Path,
@@ -256,7 +267,8 @@ def from_to(text: str) -> Any:
 
 @dataclass(frozen=True)
 class Description:
-    """Oscillator that options describe: a class of the paper with its arguments, or belts in full.
+    """Oscillator that options describe: a class of the paper with its arguments, belts in full, or
+    a file, which may also describe a machine in SI units.
 
     A command that is decorated with `describes` has these options.
     """
@@ -271,6 +283,50 @@ class Description:
     damping: Damping = 0.5
     omega: Omega = 1.0
     force: Forces = None
+    file: File = None
+
+    @functools.cached_property
+    def source(self) -> FromFile | None:
+        """What the file describes; None without a file."""
+        if self.file is None:
+            return None
+        turn_on_float64()
+        return FromFile(read(self.file), str(self.file))
+
+    @property
+    def machine(self) -> "jb.Machine | None":
+        """The machine in SI units, if the file describes one."""
+        return self.source.machine if self.source else None
+
+    @property
+    def is_forced(self) -> bool:
+        """Whether the oscillator is forced."""
+        if self.source is None:
+            return bool(self.force)
+        from ..model.oscillator import has_clock
+
+        return has_clock(self.source.own)
+
+    def dimensionless(self, value: float, quantity: str) -> float:
+        """A number of the options, in SI units with a machine, in the units of the oscillator.
+
+        quantity: a field of `Units`, such as "length".
+        """
+        return value / float(getattr(self.machine.units, quantity)) if self.machine else value
+
+    def start(self, given: Interval | None) -> Interval:
+        """The dimensionless start."""
+        if given is None:
+            return START
+        if not all(map(math.isfinite, given)):
+            raise ValueError(f"start must be finite, got {given[0]} {given[1]}")
+        return self.dimensionless(given[0], "length"), self.dimensionless(given[1], "velocity")
+
+    def refuse_machine(self, command: str) -> None:
+        """Raises if a machine is described, for a command whose results have no SI units."""
+        if self.machine:
+            expected = "a dimensionless oscillator, without mass and stiffness"
+            raise ValueError(f"file of {command} must describe {expected}, got a machine")
 
     @property
     def arguments(self) -> dict[str, float | None]:
@@ -280,13 +336,15 @@ class Description:
     @property
     def short_names(self) -> tuple[str, ...]:
         """Names of the arguments of the class; none for belts in full."""
-        return () if self.belt else tuple(CLASSES[self.system])
+        return () if self.belt or self.file else tuple(CLASSES[self.system])
 
     def check(self, **varied: float) -> None:
         """Raises unless the options describe belts; the classes themselves check numbers.
 
         varied: values of arguments of the class that vary.
         """
+        if self.source:
+            return
         for text in self.force or ():
             parts_of_force(text)
         given = _given(self.arguments | varied)
@@ -294,13 +352,40 @@ class Description:
             if given:
                 raise ValueError(f"with --belt no class must be described, got {', '.join(given)}")
             for text in self.belt:
-                _parts_of_belt(text)
+                parts_of_belt(text)
             return
         check_class(self.system)
         for name in given:
             if name not in self.short_names:
                 known = ", ".join(self.short_names)
                 raise ValueError(f"class {self.system} must have only {known}, got {name}")
+
+    def check_parameter(self, name: str) -> None:
+        """Raises unless a parameter along which something is computed is known."""
+        paths, short = self.parameters(), self.short_names
+        if name not in (*short, *paths):
+            known, meant = names_in_words(short, paths), did_you_mean(name, (*short, *paths))
+            raise ValueError(f"vary must be {known}, got {name}{meant}")
+
+    def path_along(self, name: str, span: Interval) -> tuple[Any, Any, Interval]:
+        """Oscillator, `where` and span of a path in a parameter, as the package takes them.
+
+        For an argument of a class that is no number of the oscillator it is a function, and None.
+        """
+        path = self.parameters().get(name)
+        if path is None:
+            return lambda p: self.oscillator(**{name: p}), None, span
+        import jax
+
+        from ..model.parameters import names_of
+
+        osc, (_, size) = self.oscillator(), self.unit(name)
+        place, (first, last) = names_of(osc).index(path), span
+        return osc, lambda osc: jax.tree.leaves(osc)[place], (first / size, last / size)
+
+    def unit(self, name: str) -> tuple[str, float]:
+        """Unit of a parameter of a machine, and the size of one unit of the oscillator in it."""
+        return self.source.unit(name) if self.machine and self.source else ("", 1.0)
 
     def check_axes(self, axes: Iterable[str], others: tuple[str, ...] = ()) -> None:
         """Raises unless all axes are known and different.
@@ -324,16 +409,22 @@ class Description:
         A path is the place in the oscillator, such as belts[1].friction.steepness. Parameters that
         have a short name are listed under that, too.
         """
+        if self.source:
+            return self.source.paths
         return _parameters(self.system, self.belt, self.force)
 
     def oscillator(self, **values: Any) -> "jb.Oscillator":
         """The oscillator; values: what differs from the options, as for `oscillator`."""
+        if self.source:
+            return self.source.at(**values)
         given = {**self.arguments, **values}
         return oscillator(self.system, self.belt, self.damping, self.omega, self.force, **given)
 
     def along(self, axes: Iterable[str]) -> "Callable[..., jb.Oscillator]":
         """The oscillator as a function of its axes; the function's text, which datasets keep, can
         be run."""
+        if self.source:
+            return functools.partial(oscillator_of, self.source.data)
         rest: dict[str, Any] = {"damping": self.damping, "omega": self.omega}
         if self.force:
             rest["force"] = tuple(self.force)
@@ -404,30 +495,14 @@ def oscillator(
     forcing = tuple(Harmonic(*parts_of_force(text)) for text in force or ())
     osc, paths = Oscillator(damping, belts, omega, forcing), _parameters(system, belt, force)
     others = _given({name: value for name, value in values.items() if name not in arguments})
-    return _with(osc, {paths[name]: value for name, value in others.items()}) if others else osc
-
-
-def _with(osc: "jb.Oscillator", values: dict[str, Any]) -> "jb.Oscillator":
-    """The oscillator with the parameters of these paths set."""
-    import jax
-
-    from ..checks import as_array
-    from ..model.parameters import names_of
-
-    leaves, structure = jax.tree.flatten(osc)
-    places = names_of(osc)
-    for path, value in values.items():
-        leaves[places.index(path)] = as_array(value, path)
-    changed: jb.Oscillator = jax.tree.unflatten(structure, leaves)
-    changed.check()
-    return changed
+    return changed(osc, {paths[name]: value for name, value in others.items()}) if others else osc
 
 
 def _parameters(
     system: str, belt: Sequence[str] | None, force: Sequence[str] | None = None
 ) -> dict[str, str]:
     """See `Description.parameters`."""
-    laws = [_parts_of_belt(text)[1] for text in belt or ()]
+    laws = [parts_of_belt(text)[1] for text in belt or ()]
     if not laws:
         laws = [LAWS["conti"][1]] * (1 if system == "a" else 2)
     short = {f"nu{i}": f"belts[{i}].velocity" for i in range(len(laws))} | {"zeta": "damping"}
@@ -456,83 +531,6 @@ def names_in_words(names: Iterable[str], paths: dict[str, str]) -> str:
     """Possible names of a parameter: the short ones, or one of many paths."""
     short = dict.fromkeys([*names, *(name for name, path in paths.items() if name != path)])
     one = next(path for path in paths if ".friction." in path)
-    return f"one of {', '.join(short)}, or a path such as {one} or belts[0].load"
-
-
-def parts_of_force(text: str) -> tuple[float, float, float]:
-    """Amplitude, frequency and phase of a force such as `0.3,1.7` or `0.3,1.7,0.5`."""
-    try:
-        amplitude, frequency, *phase = map(float, text.split(","))
-        (phase,) = phase or (0.0,)
-    except ValueError:
-        expected = "AMPLITUDE,FREQUENCY or AMPLITUDE,FREQUENCY,PHASE, numbers"
-        raise ValueError(f"force must be {expected}, got {text!r}") from None
-    if not all(map(math.isfinite, (amplitude, frequency, phase))) or frequency < 0:
-        raise ValueError(f"force must be finite numbers with a frequency >= 0, got {text!r}")
-    return amplitude, frequency, phase
-
-
-def parse_belt(text: str) -> "jb.Belt":
-    """Parses a belt such as `0.3,load=0.5,law=coulomb,static=0.8,kinetic=0.5`."""
-    law, friction, numbers = _parts_of_belt(text)
-    from ..model import friction as laws
-    from ..model.oscillator import Belt
-
-    return Belt(friction=getattr(laws, law)(**friction), **numbers)
-
-
-def _check_numbers(text: str, friction: dict[str, float], numbers: dict[str, float]) -> None:
-    """Raises where a belt or its law would refuse these numbers; these check only once imported."""
-
-    def fits(name: str, holds: bool, expected: str, came: float) -> None:
-        if not holds:
-            raise ValueError(f"{name} of belt {text!r} must be {expected}, got {came}")
-
-    ends = {"lower": -math.inf, "upper": math.inf} | numbers
-    own = {name: numbers.get(name, 1.0) for name in ("velocity", "load")}
-    for name, value in (*own.items(), *friction.items()):
-        fits(name, math.isfinite(value), "finite", value)
-    for name, value in (("load", own["load"]), *friction.items()):
-        fits(name, value >= 0 or name == "quadratic", ">= 0", value)
-    fits("lower", ends["lower"] < ends["upper"], f"< upper = {ends['upper']}", ends["lower"])
-    if "kinetic" in friction:
-        kinetic, static = friction["kinetic"], friction["static"]
-        fits("kinetic", kinetic <= static, f"<= static = {static}", kinetic)
-    if "velocity" in friction:
-        fits("stribeck_velocity", friction["velocity"] > 0, "> 0", friction["velocity"])
-
-
-def _parts_of_belt(text: str) -> tuple[str, dict[str, float], dict[str, float]]:
-    """Class of the law, its arguments, and those of the belt."""
-    velocity, *parts = text.split(",")
-    words = dict.fromkeys(["velocity"], velocity)
-    for part in parts:
-        name, equals, value = part.partition("=")
-        if not equals:
-            raise ValueError(f"belt {text!r} must have name=value after its velocity, got {part!r}")
-        words[name.strip()] = value
-    name_of_law = words.pop("law", "conti").strip()
-    if name_of_law not in LAWS:
-        meant = did_you_mean(name_of_law, LAWS)
-        raise ValueError(
-            f"law of belt {text!r} must be {', '.join(LAWS)}, got {name_of_law}{meant}"
-        )
-    law, defaults = LAWS[name_of_law]
-    known = ("velocity", "load", "lower", "upper", *defaults)
-    numbers: dict[str, float] = {}
-    for name, word in words.items():
-        if name not in known:
-            meant = did_you_mean(name, known)
-            raise ValueError(f"belt {text!r} must have only {', '.join(known)}, got {name}{meant}")
-        try:
-            numbers[name] = float(word)
-        except ValueError:
-            raise ValueError(f"{name} of belt {text!r} must be a number, got {word!r}") from None
-    friction: dict[str, float] = {}
-    for name, default in defaults.items():
-        value = numbers.pop(name, default)
-        if value is None:
-            raise ValueError(f"belt {text!r} must have {name}, which {name_of_law} needs")
-        friction[name.removeprefix("stribeck_")] = value
-    _check_numbers(text, friction, numbers)
-    return law, friction, numbers
+    load = next(path for path in paths if path.startswith(("belts[0].load", "belts[0].normal")))
+    words = f"a path such as {one} or {load}"
+    return f"one of {', '.join(short)}, or {words}" if short else words

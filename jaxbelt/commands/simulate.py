@@ -1,9 +1,7 @@
 """`jaxbelt simulate`: one oscillator from one start."""
 
-import csv
-import math
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -25,6 +23,7 @@ from .options import (
     tolerances,
     turn_on_float64,
 )
+from .tables import in_columns, write_columns
 
 FORMULATIONS = ("filippov", "switch", "smooth")
 
@@ -32,8 +31,14 @@ FORMULATIONS = ("filippov", "switch", "smooth")
 @describes()
 def simulate(
     described: Description,
-    start: Start = (3.0, 0.0),
-    t1: Annotated[float, typer.Option(help="End of the time span, which begins at 0.")] = 100.0,
+    start: Start = None,
+    t1: Annotated[
+        float | None,
+        typer.Option(
+            help="End of the time span, which begins at 0; of a machine in s.",
+            show_default="100, dimensionless",
+        ),
+    ] = None,
     samples: Annotated[
         int, typer.Option(help="How many times, evenly spread over the span, are written.")
     ] = 2001,
@@ -43,8 +48,20 @@ def simulate(
             help="filippov (exact), switch (the paper's switch model) or smooth (tanh for sgn)."
         ),
     ] = "filippov",
-    v_star: Annotated[float, typer.Option(help="Half-width of the switch model's band.")] = 1e-3,
-    eps: Annotated[float, typer.Option(help="Width of the smooth model's tanh.")] = 1e-3,
+    v_star: Annotated[
+        float | None,
+        typer.Option(
+            help="Half-width of the switch model's band, a velocity.",
+            show_default="0.001, dimensionless",
+        ),
+    ] = None,
+    eps: Annotated[
+        float | None,
+        typer.Option(
+            help="Width of the smooth model's tanh, likewise.",
+            show_default="0.001, dimensionless",
+        ),
+    ] = None,
     tolerance: Annotated[
         float | None,
         typer.Option(
@@ -95,26 +112,21 @@ def simulate(
             meant = did_you_mean(formulation, FORMULATIONS)
             names = ", ".join(FORMULATIONS)
             raise ValueError(f"formulation must be one of {names}, got {formulation}{meant}")
-        check_number("t1", t1)
-        asked = tolerances(tolerance)
-        if not all(map(math.isfinite, start)):
-            raise ValueError(f"start must be finite, got {start[0]} {start[1]}")
+        if t1 is not None:
+            check_number("t1", t1)
+        asked: dict[str, Any] = tolerances(tolerance)
         written = outputs(out, ".png", ".csv", "_events.csv")
         described.check()
+        y0, machine = described.start(start), described.machine
+        end = 100.0 if t1 is None else described.dimensionless(t1, "time")
+        for name, width in (("v_star", v_star), ("eps", eps)):
+            asked[name] = 1e-3 if width is None else described.dimensionless(width, "velocity")
         turn_on_float64()
         import numpy as np
 
         osc = described.oscillator()
-        trajectory = jb.simulate(
-            osc,
-            start,
-            t1,
-            ts=np.array([t1 * i / (samples - 1) for i in range(samples)]),
-            **asked,
-            formulation=formulation,
-            v_star=v_star,
-            eps=eps,
-        )
+        ts = np.array([end * i / (samples - 1) for i in range(samples)])
+        trajectory = jb.simulate(osc, y0, end, ts=ts, formulation=formulation, **asked)
         from ..model.oscillator import has_clock
         from ..paper import steady_cycle
         from ..plotting.phase import draw_overview
@@ -125,40 +137,44 @@ def simulate(
         cycle = None if has_clock(osc) else steady_cycle(trajectory)
         with journal_style():
             figure = draw_overview(osc, trajectory, cycles=[cycle] if cycle else [])
+            if machine:
+                jb.plot_in_si(figure.axes, machine)
             save(figure, written[0])
-        write_samples(trajectory, written[1])
-        write_events(trajectory, written[2])
-    data = {
-        "status": jb.Status(int(trajectory.status)).name,
-        "t": as_json_value(trajectory.ts[-1]),
-        "x1": as_json_value(trajectory.ys[-1, 0]),
-        "x2": as_json_value(trajectory.ys[-1, 1]),
-        "events": len(trajectory.events.t),
-    }
-    say(console, [repr(trajectory)], written, as_json=as_json, data=data)
+        found = jb.in_si(trajectory, machine) if machine else None
+        at_samples, at_events = samples_of(trajectory, found), events_of(trajectory, found)
+        write_columns(at_samples, written[1])
+        write_columns(at_events, written[2])
+    status = jb.Status(int(trajectory.status))
+    last = {name: as_json_value(column[-1]) for name, column in list(at_samples.items())[:3]}
+    data = {"status": status.name, **last, "events": len(trajectory.events.t)}
+    lines = [repr(trajectory)]
+    if machine:
+        ends = ", ".join(f"{name} {value:.6g}" for name, value in last.items() if value is not None)
+        lines = [f"ends at {ends}; {trajectory.events!r}, status {status.name}: "]
+        lines[0] += jb.describe(trajectory.status)
+    say(console, lines, written, as_json=as_json, data=data)
     if int(trajectory.status) >= jb.Status.TOO_MANY_SEGMENTS:
         raise typer.Exit(1)
 
 
-def write_samples(trajectory: "jb.Trajectory", path: Path) -> None:
-    """Writes t, x1, x2 and the contact code of every belt, a row for each sample, to the last
-    digit."""
-    modes = trajectory.modes
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(["t", "x1", "x2", *(f"mode{i}" for i in range(modes.shape[1]))])
-        ts, ys = trajectory.ts.tolist(), trajectory.ys.tolist()
-        for t, y, mode in zip(ts, ys, modes.tolist(), strict=True):
-            writer.writerow([t, *y, *mode])
+def samples_of(trajectory: "jb.Trajectory", found: Any = None) -> dict[str, Any]:
+    """Columns t, x1, x2 and the contact code of every belt, a row for each sample.
+
+    found: the trajectory in SI units; then the columns have units, and there is the friction.
+    """
+    columns = dict(t=trajectory.ts, x1=trajectory.ys[:, 0], x2=trajectory.ys[:, 1])
+    if found is not None:
+        columns = in_columns(found, [name for name in (*columns, "force") if name in found])
+    modes = zip(*trajectory.modes.tolist(), strict=True)
+    return columns | {f"mode{i}": mode for i, mode in enumerate(modes)}
 
 
-def write_events(trajectory: "jb.Trajectory", path: Path) -> None:
-    """Writes t, x1, x2, kind and belt, a row for each event."""
+def events_of(trajectory: "jb.Trajectory", found: Any = None) -> dict[str, Any]:
+    """Columns t, x1, x2, kind and belt, a row for each event; found: as for `samples_of`."""
     events = trajectory.events
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(["t", "x1", "x2", "kind", "belt"])
-        columns = events.t.tolist(), events.y.tolist()
-        kinds = [jb.EventKind(kind).name for kind in events.kind.tolist()]
-        for t, y, kind, belt in zip(*columns, kinds, events.belt.tolist(), strict=True):
-            writer.writerow([t, *y, kind, belt])
+    columns = dict(t=events.t, x1=events.y[:, 0], x2=events.y[:, 1])
+    if found is not None:
+        in_si = in_columns(found, [f"{name}_event" for name in columns])
+        columns = {name.replace("_event", ""): column for name, column in in_si.items()}
+    kinds = [jb.EventKind(kind).name for kind in events.kind.tolist()]
+    return columns | {"kind": kinds, "belt": events.belt}

@@ -10,6 +10,7 @@ import typer
 import jaxbelt as jb
 
 from ..spelling import did_you_mean
+from .files import FromFile
 from .options import (
     Description,
     Json,
@@ -48,7 +49,7 @@ ENDS = {"attractor": None, "final": 100.0, "lyapunov": 1000.0}
 OF_BELTS = ("sticks", "stick_duration", "mode_end")
 
 
-@describes("system", "belt", "damping", "omega", "force")
+@describes("system", "belt", "damping", "omega", "force", "file")
 def sweep(
     axes: Annotated[
         list[str],
@@ -74,11 +75,11 @@ def sweep(
             show_default="kind, of the final state x1_end",
         ),
     ] = None,
-    start: Start = (3.0, 0.0),
+    start: Start = None,
     t1: Annotated[
         float | None,
         typer.Option(
-            help="End of each run.",
+            help="End of each run; of a machine in s.",
             show_default="30000 for attractors, 100 for the final state, 1000 for exponents",
         ),
     ] = None,
@@ -144,14 +145,20 @@ def sweep(
         parsed = list(map(parse_axis, axes))
         described.check_axes([name for name, _ in parsed], others=("x1", "x2"))
         values = dict(parsed)
-        known = VARIABLES_FORCED if described.force else VARIABLES
+        known = VARIABLES_FORCED if described.is_forced else VARIABLES
         if observe not in known:
             meant = did_you_mean(observe, known)
             raise ValueError(f"observe must be {' or '.join(known)}, got {observe}{meant}")
         shown = variable or known[observe][0]
         drawn = part is None and sum(len(axis) > 1 for axis in values.values()) in (1, 2)
         _check_variable(shown, known[observe])
-        asked: dict[str, Any] = dict(y0=start, observe=observe, **tolerances(tolerance))
+        machine = described.machine
+        if machine and out.suffix == ".zarr":
+            expected = "a store keeps dimensionless numbers"
+            raise ValueError(f"out of a machine must end in .nc, as {expected}, got {out}")
+        asked: dict[str, Any] = dict(
+            y0=described.start(start), observe=observe, **tolerances(tolerance)
+        )
         if t1 is not None:
             check_number("t1", t1)
         if out.suffix == ".nc":
@@ -160,7 +167,10 @@ def sweep(
         turn_on_float64()
         own = [name for name in values if name not in ("x1", "x2")]
         make = described.along(own)
-        asked["t1"] = ENDS[observe] if t1 is None else t1
+        asked["t1"] = ENDS[observe] if t1 is None else described.dimensionless(t1, "time")
+        for name, quantity in (("x1", "length"), ("x2", "velocity")):
+            if name in values:
+                values[name] = [described.dimensionless(one, quantity) for one in values[name]]
         if dry_run:
             estimate = jb.explain(make, values, **asked)
             say(console, [repr(estimate)], [], as_json=as_json, data=asdict(estimate))
@@ -169,6 +179,8 @@ def sweep(
             dataset = jb.sweep(make, values, **asked, store=out, blocks=part)
         else:
             dataset = jb.sweep(make, values, **asked)
+            if described.source and machine:
+                dataset = _in_si(dataset, described.source, own)
             out.parent.mkdir(parents=True, exist_ok=True)
             # Version 3 of the format needs no library but SciPy.
             dataset.to_netcdf(out, engine="scipy")
@@ -177,6 +189,19 @@ def sweep(
             written.append(out.with_suffix(".png"))
             _draw_variable(dataset, shown, written[1])
     say(console, [repr(dataset)], written, as_json=as_json, data=_counts_as_data(dataset))
+
+
+def _in_si(dataset: Any, source: FromFile, axes: list[str]) -> Any:
+    """The dataset of a machine in SI units, with the units of its axes.
+
+    The parameters vary in the units of the machine in the file.
+    """
+    machine: Any = source.machine
+    found = jb.in_si(dataset, (lambda **_: machine.units) if axes else machine)
+    for name in axes:
+        if unit := source.unit(name)[0]:
+            found[name].attrs["units"] = unit
+    return found.assign_attrs(machine=repr(machine))
 
 
 def _check_variable(name: str, variables: tuple[str, ...]) -> None:

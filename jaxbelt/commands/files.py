@@ -1,0 +1,272 @@
+"""An oscillator, or a machine in SI units, from a TOML file, for `--file`.
+
+Keys of the file are arguments of the classes: of `Machine` and `PhysicalBelt` where there is a mass
+or a stiffness, else of `Oscillator` and `Belt`. A table in place of a velocity or a load is an
+`Oscillating`; `law` and `kind` choose the class of a friction law and of a force. The classes check
+all values; here their messages get the place in the file.
+"""
+
+import csv
+import inspect
+import tomllib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jaxbelt as jb
+
+from ..spelling import did_you_mean
+
+#: Classes by the words that choose them, for each key of such a word.
+CLASSES_OF = {
+    "law": {
+        **{"conti": "Conti", "coulomb": "Coulomb", "stribeck": "Stribeck", "cubic": "Cubic"},
+        "table": "Tabulated",
+    },
+    "kind": {"harmonic": "Harmonic", "base_motion": "BaseMotion"},
+}
+#: Columns of a table of friction.
+COLUMNS = ("speed", "mu")
+
+
+@dataclass(frozen=True)
+class Place:
+    """A place in a file: the path of a table or a value, such as belts[0].friction."""
+
+    file: str
+    path: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.path} in {self.file}" if self.path else self.file
+
+    def at(self, key: str | int) -> "Place":
+        """The place of an entry."""
+        step = f"[{key}]" if isinstance(key, int) else f".{key}" if self.path else key
+        return Place(self.file, self.path + step)
+
+    def must(self, expected: str, came: str) -> ValueError:
+        """An error about what is here."""
+        return ValueError(f"{self} must {expected}, got {came}")
+
+    def blamed(self, message: str, table: dict[str, Any]) -> ValueError:
+        """The error of a class that was made from a table here, with the place of the value."""
+        subject, must, rest = message.partition(" must be ")
+        place, inner = self, table
+        # Such as "kinetic of Coulomb", or "mean of load of belt".
+        for word in reversed(subject.split(" of ")):
+            if isinstance(inner, dict) and word in inner:
+                place, inner = place.at(word), inner[word]
+        return ValueError(f"{place}{must}{rest}" if place != self else f"{self}: {message}")
+
+
+def read(path: Path) -> dict[str, Any]:
+    """The content of a TOML file, tables of friction included."""
+    try:
+        with path.open("rb") as file:
+            data = tomllib.load(file)
+    except OSError as error:
+        raise ValueError(f"file must be a TOML file, got {path}: {error.strerror}") from None
+    except ValueError as error:
+        raise ValueError(f"file must be TOML, got {path}: {error}") from None
+    for belt, place in _tables(data.get("belts", []), Place(str(path), "belts")):
+        law = belt.get("friction")
+        if isinstance(law, dict) and law.get("law") == "table" and "file" in law:
+            at = place.at("friction")
+            if law.keys() & {"speeds", "coefficients"}:
+                raise at.must("have a file, or speeds and coefficients", "both")
+            name = law.pop("file")
+            if not isinstance(name, str):
+                raise at.at("file").must("be the path of a CSV file", repr(name))
+            law["speeds"], law["coefficients"] = read_table(path.parent / name, at.at("file"))
+    return data
+
+
+def read_table(path: Path, place: Place | str = "file") -> tuple[list[float], list[float]]:
+    """Speeds and coefficients from a CSV file with the columns speed and mu."""
+
+    def must(expected: str, came: str) -> ValueError:
+        return ValueError(f"{place} must be {expected}, got {came}")
+
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file, skipinitialspace=True)
+            names = [name.strip() for name in reader.fieldnames or ()]
+            reader.fieldnames = names
+            if not {*COLUMNS} <= {*names}:
+                came = f"{path} with {', '.join(names) or 'none'}"
+                raise must("a CSV file with the columns speed and mu", came)
+            rows = [[row[name] for name in COLUMNS] for row in reader]
+    except OSError as error:
+        raise must("a CSV file", f"{path}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise must("a CSV file", f"{path}, which is no text") from None
+    for number, row in enumerate(rows, start=2):
+        try:
+            row[:] = map(float, row)
+        except (TypeError, ValueError):
+            came = ", ".join(map(repr, row))
+            raise must("a CSV file of numbers", f"{came} in line {number} of {path}") from None
+    return [row[0] for row in rows], [row[1] for row in rows]
+
+
+def made(data: dict[str, Any], file: str) -> "jb.Machine | jb.Oscillator":
+    """The machine or the oscillator that a file describes."""
+    top = Place(file)
+    belts = data.get("belts", [])
+    in_belts = {key for belt, _ in _tables(belts, top.at("belts")) for key in belt}
+    is_machine = bool({"mass", "stiffness"} & data.keys() or "normal_force" in in_belts)
+    belt: Any = jb.PhysicalBelt if is_machine else jb.Belt
+
+    def as_belts(tables: Any, place: Place) -> list[Any]:
+        return [_object(belt, table, at, parts) for table, at in _tables(tables, place)]
+
+    def as_forcing(tables: Any, place: Place) -> list[Any]:
+        return [_chosen("kind", table, at, "harmonic") for table, at in _tables(tables, place)]
+
+    waves = dict.fromkeys(("velocity", "load", "normal_force"), _as_wave)
+    parts: Parts = waves | {"friction": lambda table, at: _chosen("law", table, at)}
+    whole: Any = jb.Machine if is_machine else jb.Oscillator
+    return _object(whole, data, top, {"belts": as_belts, "forcing": as_forcing})
+
+
+#: What makes the objects in a table, by key.
+Parts = dict[str, Callable[[Any, Place], Any]]
+
+
+def _object(
+    kind: Callable, table: Any, place: Place, parts: Parts | None = None, choice: str = ""
+) -> Any:
+    """An object of a class from a table of its arguments.
+
+    choice: the key that has chosen the class, which is no argument.
+    """
+    _, *arguments = inspect.signature(vars(kind)["__init__"]).parameters.values()
+    known = [*([choice] if choice else []), *(one.name for one in arguments)]
+    if choice == "law" and "speeds" in known:
+        known.append("file")
+    for name in table:
+        if name not in known:
+            came = f"{name}{did_you_mean(name, known)}"
+            raise place.must(f"have only {', '.join(known)}", came)
+    values: dict[str, Any] = {}
+    for one in arguments:
+        if one.name in table:
+            value, at = table[one.name], place.at(one.name)
+            make = (parts or {}).get(one.name)
+            if make is None and isinstance(value, list) and one.name not in TABULATED:
+                raise at.must("be a number", repr(value))
+            values[one.name] = make(value, at) if make else value
+        elif one.default is one.empty:
+            raise place.must(f"have {one.name}", ", ".join(table) or "nothing")
+    try:
+        return kind(**values)
+    except ValueError as error:
+        raise place.blamed(str(error), table) from error
+
+
+#: Arguments that are lists of numbers.
+TABULATED = ("speeds", "coefficients")
+
+
+def _chosen(key: str, table: Any, place: Place, default: str | None = None) -> Any:
+    """An object of the class that a word of its table chooses."""
+    known = CLASSES_OF[key]
+    if not isinstance(table, dict):
+        raise place.must(f"be a table with the key {key}", repr(table))
+    word = table.get(key, default)
+    if word is None:
+        raise place.must(f"have {key}", ", ".join(table) or "nothing")
+    if not (isinstance(word, str) and word in known):
+        came = f"{word!r}{did_you_mean(word, known)}"
+        raise place.at(key).must(f"be {', '.join(known)}", came)
+    return _object(getattr(jb, known[word]), table, place, choice=key)
+
+
+def _as_wave(value: Any, place: Place) -> Any:
+    return _object(jb.Oscillating, value, place) if isinstance(value, dict) else value
+
+
+def _tables(value: Any, place: Place) -> Iterator[tuple[dict[str, Any], Place]]:
+    """The tables of an array, or a single one."""
+    tables = [value] if isinstance(value, dict) else value
+    if not (isinstance(tables, list) and all(isinstance(one, dict) for one in tables)):
+        raise place.must(f"be tables, [[{place.path}]]", repr(value))
+    return ((table, place.at(i)) for i, table in enumerate(tables))
+
+
+class FromFile:
+    """What a file describes, and its parameters by name, in SI units where it is a machine.
+
+    Parameters vary in the units of the machine as it stands in the file. So mass and stiffness,
+    which make these units, are not among them.
+
+    Attributes:
+        data: Content of the file.
+        machine: The machine; None for a dimensionless oscillator.
+        own: The dimensionless oscillator.
+        paths: Paths of parameters in `own`, by their paths in the file; without a machine also by
+            their short names.
+    """
+
+    def __init__(self, data: dict[str, Any], file: str):
+        import jax
+
+        from ..model.parameters import names_of
+
+        self.data = data
+        # Known numbers stay known where a program is traced.
+        with jax.ensure_compile_time_eval():
+            found: Any = made(data, file)
+            self.machine = found if isinstance(found, jb.Machine) else None
+            self.own: jb.Oscillator = found if self.machine is None else found.oscillator
+        names = names_of(self.own)
+        if self.machine is None:
+            short = {f"nu{i}": f"belts[{i}].velocity" for i in range(len(self.own.belts))}
+            short = {name: path for name, path in short.items() if path in names}
+            self.paths = short | {"zeta": "damping"} | {name: name for name in names}
+            return
+        self.paths = {}
+        for name in names_of(self.machine):
+            path = name.replace(".normal_force", ".load")
+            # A law without a unit of its own is wrapped.
+            for one in (path, path.replace(".friction.", ".friction.law.")):
+                if one in names:
+                    self.paths[name] = one
+
+    def unit(self, name: str) -> tuple[str, float]:
+        """Unit of a parameter in the file, and the size of 1 in the oscillator's units."""
+        if self.machine is None:
+            return "", 1.0
+        import jax
+
+        from ..si import unit_of
+
+        with jax.ensure_compile_time_eval():
+            return unit_of(self.paths[name], self.own, self.machine.units)
+
+    def at(self, **values: Any) -> "jb.Oscillator":
+        """The dimensionless oscillator with parameters set, in the units of the file."""
+        scaled = {self.paths[name]: value / self.unit(name)[1] for name, value in values.items()}
+        return changed(self.own, scaled)
+
+
+def oscillator_of(data: dict[str, Any], **values: Any) -> "jb.Oscillator":
+    """The dimensionless oscillator of a file with this content, parameters set in its units."""
+    return FromFile(data, "the file").at(**values)
+
+
+def changed(osc: "jb.Oscillator", values: dict[str, Any]) -> "jb.Oscillator":
+    """The oscillator with the parameters of these paths set."""
+    import jax
+
+    from ..checks import as_array
+    from ..model.parameters import names_of
+
+    leaves, structure = jax.tree.flatten(osc)
+    places = names_of(osc)
+    for path, value in values.items():
+        leaves[places.index(path)] = as_array(value, path)
+    other: jb.Oscillator = jax.tree.unflatten(structure, leaves)
+    other.check()
+    return other

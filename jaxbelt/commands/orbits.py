@@ -1,0 +1,140 @@
+"""`jaxbelt orbits`: an orbit diagram, the points of attractors along a parameter."""
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+import jaxbelt as jb
+
+from ..spelling import did_you_mean
+from .options import (
+    Description,
+    Interval,
+    Json,
+    Out,
+    Start,
+    check_range,
+    describes,
+    from_to,
+    make_console,
+    outputs,
+    plain_errors,
+    say,
+    turn_on_float64,
+)
+from .tables import in_columns, with_unit, write_columns
+
+QUANTITIES = ("x1", "x2")
+
+
+@describes()
+def orbits(
+    described: Description,
+    parameter: Annotated[
+        str,
+        typer.Option(
+            "--vary",
+            help="The parameter: nu0, nu1, ..., zeta, sigma, sigma0, sigma1, or its path, such as "
+            "forcing[0].frequency.",
+        ),
+    ] = "nu0",
+    span: Annotated[Interval, from_to("Its first and last value; of a machine in its SI unit.")] = (
+        -0.7,
+        0.7,
+    ),
+    rows: Annotated[int, typer.Option(help="How many values, evenly spread.")] = 400,
+    start: Start = None,
+    also: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="X1,X2",
+            help="A further start; give it once a start. Where attractors coexist, each start "
+            "shows its own.",
+            show_default="none",
+        ),
+    ] = None,
+    quantity: Annotated[
+        str, typer.Option(help="x1 or x2: whose extrema the points are, and what is drawn.")
+    ] = "x1",
+    out: Out = Path("orbits"),
+    as_json: Json = False,
+) -> None:
+    """The points of attractors along a parameter, from given starts, by brute force.
+
+    At each value the starts are followed until their attractors are known. Points of a cycle are
+    the extrema in one loop; with forcing they are the states once in each of its periods.
+
+    - **OUT.png**: the points over the parameter.
+
+    - **OUT.csv**: value, start (its number), kind, period, x1, x2 of every point.
+
+    An oscillator is described as for **simulate**; the parameter that varies needs no value. Of a
+    machine all is in SI units. Unstable motions are in **diagram** only.
+
+    Examples:
+
+    - jaxbelt orbits --class b --nu1 0.35 --span 0 0.7
+
+    - jaxbelt orbits --belt 1,law=coulomb,static=1,kinetic=0.6 --damping 0 --force 0.5,1
+      --vary "forcing[0].frequency" --span 0.4 0.8 --also 0,0.5
+
+    - jaxbelt orbits --file machine.toml --vary "belts[0].normal_force" --span 5 30
+    """
+    console = make_console()
+    with plain_errors():
+        if rows < 2:
+            raise ValueError(f"rows must be at least 2, got {rows}")
+        if quantity not in QUANTITIES:
+            meant = did_you_mean(quantity, QUANTITIES)
+            raise ValueError(f"quantity must be x1 or x2, got {quantity}{meant}")
+        check_range("span", span)
+        further = list(map(parse_start, also or ()))
+        written = outputs(out, ".png", ".csv")
+        described.check(**({parameter: span[0]} if parameter in described.short_names else {}))
+        described.check_parameter(parameter)
+        turn_on_float64()
+        y0 = [described.start(one) for one in (start, *further)]
+        path = described.path_along(parameter, span)
+        at = None if described.is_forced else jb.AtExtrema(quantity)
+        found = jb.orbit_diagram(*path, at=at, y0=y0, rows=rows)
+        if path[1] is None:
+            found = replace(found, name=parameter)
+        from ..plotting.style import journal_figure, journal_style, save
+
+        with journal_style():
+            figure = journal_figure(7.2, 4.2)
+            ax = figure.subplots()
+            if described.machine:
+                jb.plot_in_si(found, described.machine, ax, quantity=quantity)
+            else:
+                found.plot(ax, quantity=quantity)
+            out.parent.mkdir(parents=True, exist_ok=True)
+            save(figure, written[0])
+        table: Any = found.table()
+        columns = {str(name): table[name].tolist() for name in table}
+        if described.machine:
+            columns = in_columns(jb.in_si(found, described.machine), [*columns])
+        write_columns(columns, written[1])
+    kinds = found.kind.ravel().tolist()
+    counts = dict(Counter(kinds))
+    data = {"parameter": parameter, "runs": len(kinds), "kinds": counts}
+    lines = [repr(found)]
+    if described.machine:
+        symbol = described.unit(parameter)[0]
+        words = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+        ends = f"{span[0]:g} to {span[1]:g}"
+        lines = [f"{with_unit(parameter, symbol)} from {ends}, {len(kinds)} runs: {words}"]
+        data["unit"] = symbol
+    say(console, lines, written, as_json=as_json, data=data)
+
+
+def parse_start(text: str) -> tuple[float, float]:
+    """Parses a start such as `0.5,-1`."""
+    try:
+        x1, x2 = map(float, text.split(","))
+    except ValueError:
+        raise ValueError(f"also must be X1,X2, two numbers, got {text!r}") from None
+    return x1, x2
