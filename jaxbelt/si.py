@@ -52,6 +52,8 @@ DIMENSIONS = {
     **dict.fromkeys(("x2", "x2_event", "x2_end", "x2_min", "x2_max"), "velocity"),
     **{"x1_residual": "length", "x2_residual": "velocity"},
     **{"shock_x1": "length", "shock_x2": "velocity"},
+    **{"x1_strobe": "length", "x2_strobe": "velocity"},
+    **dict.fromkeys(("exponent", "exponent_error"), "rate"),
     "force": "force",
     "energy": "energy",
 }
@@ -76,7 +78,10 @@ POWER_ROUNDING = 1e-12
 SAME_MACHINE = 1e-9
 #: Results along a parameter.
 AlongParameter = BifurcationDiagram | OrbitDiagram | BasinFractions
-SYMBOLS = {"time": "s", "length": "m", "velocity": "m s-1", "force": "N", "energy": "J"}
+SYMBOLS = {
+    **{"time": "s", "length": "m", "velocity": "m s-1", "force": "N", "energy": "J"},
+    "rate": "s-1",
+}
 
 
 #: Where the mass rests, at the end of the words for an attractor of `basins`.

@@ -220,7 +220,7 @@ def test_sweep_of_belts_of_ones_own(tmp_path):
         ),
         (
             "--belt 0.3,law=dry",
-            "law of belt '0.3,law=dry' must be conti, coulomb, stribeck, got dry",
+            "law of belt '0.3,law=dry' must be conti, coulomb, stribeck, cubic, got dry",
         ),
         (
             "--belt 0.3,law=coulomb,grip=1",

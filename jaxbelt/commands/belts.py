@@ -11,7 +11,10 @@ LAWS: dict[str, tuple[str, dict[str, float | None]]] = {
     "conti": ("Conti", {"static": 1.0, "residual": 0.6, "steepness": 10.0, "quadratic": 0.0}),
     "coulomb": ("Coulomb", {"static": None, "kinetic": None}),
     "stribeck": ("Stribeck", {"static": None, "kinetic": None, "stribeck_velocity": None}),
+    "cubic": ("Cubic", {"a0": None, "a1": None, "a3": None}),
 }
+#: Arguments of laws that may be negative.
+SIGNED = ("quadratic", "a1", "a3")
 
 
 def parts_of_force(text: str) -> tuple[float, float, float]:
@@ -48,7 +51,7 @@ def _check_numbers(text: str, friction: dict[str, float], numbers: dict[str, flo
     for name, value in (*own.items(), *friction.items()):
         fits(name, math.isfinite(value), "finite", value)
     for name, value in (("load", own["load"]), *friction.items()):
-        fits(name, value >= 0 or name == "quadratic", ">= 0", value)
+        fits(name, value >= 0 or name in SIGNED, ">= 0", value)
     fits("lower", ends["lower"] < ends["upper"], f"< upper = {ends['upper']}", ends["lower"])
     if "kinetic" in friction:
         kinetic, static = friction["kinetic"], friction["static"]

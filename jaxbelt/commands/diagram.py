@@ -118,7 +118,7 @@ def diagram(
                 jb.plot_in_si(found, described.machine, figure.subplots(), quantity=quantity)
             else:
                 plot_diagram(found, figure.subplots(), quantity=quantity)
-            draw_key(figure)
+                draw_key(figure)
             out.parent.mkdir(parents=True, exist_ok=True)
             save(figure, written[0])
         unit = described.unit(parameter)

@@ -17,13 +17,11 @@ from typing import Any
 import jaxbelt as jb
 
 from ..spelling import did_you_mean
+from .belts import LAWS
 
 #: Classes by the words that choose them, for each key of such a word.
 CLASSES_OF = {
-    "law": {
-        **{"conti": "Conti", "coulomb": "Coulomb", "stribeck": "Stribeck", "cubic": "Cubic"},
-        "table": "Tabulated",
-    },
+    "law": {name: law for name, (law, _) in LAWS.items()} | {"table": "Tabulated"},
     "kind": {"harmonic": "Harmonic", "base_motion": "BaseMotion"},
 }
 #: Columns of a table of friction.
@@ -153,9 +151,9 @@ def _object(
     for one in arguments:
         if one.name in table:
             value, at = table[one.name], place.at(one.name)
-            make = (parts or {}).get(one.name)
-            if make is None and isinstance(value, list) and one.name not in TABULATED:
+            if isinstance(value, list) and one.name not in LISTS:
                 raise at.must("be a number", repr(value))
+            make = (parts or {}).get(one.name)
             values[one.name] = make(value, at) if make else value
         elif one.default is one.empty:
             raise place.must(f"have {one.name}", ", ".join(table) or "nothing")
@@ -165,8 +163,8 @@ def _object(
         raise place.blamed(str(error), table) from error
 
 
-#: Arguments that are lists of numbers.
-TABULATED = ("speeds", "coefficients")
+#: Arguments that are lists.
+LISTS = ("belts", "forcing", "speeds", "coefficients")
 
 
 def _chosen(key: str, table: Any, place: Place, default: str | None = None) -> Any:

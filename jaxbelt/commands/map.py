@@ -65,8 +65,8 @@ def region_map(
     """
     console = make_console()
     with plain_errors():
-        described.check_axes(axes)
         described.refuse_machine("map")
+        described.check_axes(axes)
         if cells < 2:
             raise ValueError(f"cells must be at least 2, got {cells}")
         check_range("p", p)

@@ -529,7 +529,9 @@ def check_class(system: str) -> None:
 
 def names_in_words(names: Iterable[str], paths: dict[str, str]) -> str:
     """Possible names of a parameter: the short ones, or one of many paths."""
-    short = dict.fromkeys([*names, *(name for name, path in paths.items() if name != path)])
+    short = dict.fromkeys(
+        [*names, *(name for name in paths if "." not in name and paths[name] != name)]
+    )
     one = next(path for path in paths if ".friction." in path)
     load = next(path for path in paths if path.startswith(("belts[0].load", "belts[0].normal")))
     words = f"a path such as {one} or {load}"

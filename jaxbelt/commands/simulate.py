@@ -94,7 +94,38 @@ def simulate(
     - d: belt 0 below sigma1, belt 1 above sigma0. Give --nu0 --nu1 --sigma0 --sigma1.
 
     The laws of a --belt are conti (static, residual, steepness, quadratic; those of the paper
-    unless given), coulomb (static, kinetic) and stribeck (static, kinetic, stribeck_velocity).
+    unless given), coulomb (static, kinetic), stribeck (static, kinetic, stribeck_velocity) and
+    cubic (a0, a1, a3).
+
+    A --file has the arguments of the Python classes: of Machine and PhysicalBelt in SI units, as
+    here, or without mass and stiffness those of Oscillator and Belt. With a machine all that is
+    given and written is in SI units.
+
+    ```toml
+    mass = 1.2
+    stiffness = 300.0
+    damping = 4.0
+
+    [[belts]]
+    velocity = 0.12
+    normal_force = { mean = 20.0, amplitude = 5.0, frequency = 14.0 }
+    [belts.friction]
+    law = "stribeck"    # or conti, coulomb, cubic
+    static = 0.5
+    kinetic = 0.3
+    velocity = 0.05
+
+    [[belts]]
+    velocity = 0.1
+    normal_force = 10.0
+    lower = 0.02
+    friction = { law = "table", file = "mu.csv" }    # columns: speed, mu
+
+    [[forcing]]
+    kind = "harmonic"    # or base_motion
+    amplitude = 3.0
+    frequency = 14.0     # in rad/s
+    ```
 
     Examples:
 
@@ -103,6 +134,8 @@ def simulate(
     - jaxbelt simulate --class d --nu1 -0.3 --sigma0 0 --sigma1 0.5 --out overlap
 
     - jaxbelt simulate --belt 0.3 --belt 0.5,law=coulomb,static=0.8,kinetic=0.5,lower=0.2
+
+    - jaxbelt simulate --file machine.toml --start 0.05 0 --t1 4
     """
     console = make_console()
     with plain_errors():

@@ -120,7 +120,8 @@ def sweep(
     Takes some seconds to compile; **--dry-run** estimates how long the runs will take.
 
     An oscillator is described as for **simulate**. What is not an axis has the value given there,
-    or the default of **simulate**.
+    or the default of **simulate**. Of a machine all is in SI units; its mass and stiffness, which
+    make the units of the others, are no axes.
 
     Examples:
 
@@ -132,6 +133,8 @@ def sweep(
       0.5,law=coulomb,static=0.8,kinetic=0.5 --damping 0.1
 
     - jaxbelt sweep "forcing[0].frequency=0.5:2:64" nu0=0.1:1:64 --class a --force 0.5,1.2
+
+    - jaxbelt sweep "belts[0].normal_force=5:30:64" --file machine.toml --start 0.05 0
 
     - jaxbelt sweep nu0=-0.7:0.7:8192 nu1=-0.7:0.7:8192 --out plane.zarr --blocks 0:64
     """
@@ -156,9 +159,8 @@ def sweep(
         if machine and out.suffix == ".zarr":
             expected = "a store keeps dimensionless numbers"
             raise ValueError(f"out of a machine must end in .nc, as {expected}, got {out}")
-        asked: dict[str, Any] = dict(
-            y0=described.start(start), observe=observe, **tolerances(tolerance)
-        )
+        y0 = described.start(start)
+        asked: dict[str, Any] = dict(y0=y0, observe=observe, **tolerances(tolerance))
         if t1 is not None:
             check_number("t1", t1)
         if out.suffix == ".nc":
@@ -180,7 +182,7 @@ def sweep(
         else:
             dataset = jb.sweep(make, values, **asked)
             if described.source and machine:
-                dataset = _in_si(dataset, described.source, own)
+                dataset = _in_si(dataset, described.source, own, y0)
             out.parent.mkdir(parents=True, exist_ok=True)
             # Version 3 of the format needs no library but SciPy.
             dataset.to_netcdf(out, engine="scipy")
@@ -191,16 +193,22 @@ def sweep(
     say(console, [repr(dataset)], written, as_json=as_json, data=_counts_as_data(dataset))
 
 
-def _in_si(dataset: Any, source: FromFile, axes: list[str]) -> Any:
-    """The dataset of a machine in SI units, with the units of its axes.
+def _in_si(dataset: Any, source: FromFile, axes: list[str], y0: tuple[float, float]) -> Any:
+    """The dataset of a machine in SI units, with the units of its axes and of its start.
 
     The parameters vary in the units of the machine in the file.
     """
     machine: Any = source.machine
-    found = jb.in_si(dataset, (lambda **_: machine.units) if axes else machine)
+    units = machine.units
+    found = jb.in_si(dataset, (lambda **_: units) if axes else machine)
     for name in axes:
         if unit := source.unit(name)[0]:
             found[name].attrs["units"] = unit
+    start = {"x1": (y0[0] * units.length, "m"), "x2": (y0[1] * units.velocity, "m/s")}
+    fixed = {name: of for name, of in start.items() if name not in found.dims}
+    if words := [f"{name} = {value:.6g} {unit}" for name, (value, unit) in fixed.items()]:
+        _, among, several = found.attrs["start"].partition(": of several")
+        found.attrs["start"] = ", ".join(words) + among + several
     return found.assign_attrs(machine=repr(machine))
 
 

@@ -67,6 +67,11 @@ class Units(eqx.Module):
         for name, value in vars(self).items():
             check_positive(value, name)
 
+    @property
+    def rate(self) -> Any:
+        """Unit of rates, such as exponents, in 1/s."""
+        return 1.0 / self.time
+
     def __repr__(self) -> str:
         symbols = {"time": "s", "length": "m", "velocity": "m/s", "force": "N", "energy": "J"}
         parts = (f"{name} {number(getattr(self, name))} {of}" for name, of in symbols.items())
