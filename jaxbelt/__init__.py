@@ -38,8 +38,8 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     paper           the paper's table and figures
     api             the public names
     __init__        the public names, imported when the first one is used
-    commands/       options reproduce simulate diagram map sweep basins verify warm
-    commands/       cache
+    commands/       belts files options tables reproduce simulate diagram orbits map
+    commands/       sweep basins verify warm cache
     cli             the command line
 """
 

@@ -4,6 +4,7 @@ import csv
 import functools
 import json
 import tomllib
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -44,7 +45,7 @@ def written(folder, text, name="given.toml"):
     return path
 
 
-def described(folder, text):
+def described(folder, text) -> Any:
     return Description(file=written(folder, text)).source
 
 
@@ -140,7 +141,7 @@ def test_a_dimensionless_file(tmp_path):
 
 
 def test_the_file_in_the_help_is_one(tmp_path):
-    _, _, text = simulate.__doc__.partition("```toml")
+    _, _, text = str(simulate.__doc__).partition("```toml")
     written(tmp_path, "speed,mu\n0,0.5\n0.1,0.4\n", "mu.csv")
     found = described(tmp_path, text.partition("```")[0])
     assert isinstance(found.machine, jb.Machine) and len(found.machine.belts) == 2
@@ -188,13 +189,13 @@ def test_parameters_vary_in_the_units_of_the_file(tmp_path, law):
 
 def test_the_function_of_a_sweep_does_not_need_the_file(tmp_path):
     path = written(tmp_path, MACHINE)
-    make = Description(file=path).along(["belts[0].velocity"])
+    make: Any = Description(file=path).along(["belts[0].velocity"])
     path.unlink()
     again = eval(f"files.oscillator_of({make.args[0]!r}, **{{'belts[0].velocity': 0.1}})")
     # The unit of velocity is that of the file.
     expected = machine(velocity=0.1).oscillator
     np.testing.assert_allclose(jax.tree.leaves(again), jax.tree.leaves(expected), rtol=1e-14)
-    assert files.made(tomllib.loads(MACHINE), "") is not None
+    assert files.described_by(tomllib.loads(MACHINE), "") is not None
 
 
 # --- mistakes -----------------------------------------------------------------------------------

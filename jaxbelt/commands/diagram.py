@@ -26,7 +26,7 @@ from .options import (
     say,
     turn_on_float64,
 )
-from .tables import in_columns, with_unit, write_columns
+from .tables import headed, in_columns, write_columns
 
 #: Arguments of classes that may be varied besides velocities: an edge of two belts, or of one.
 EDGES = ("sigma", "sigma0", "sigma1")
@@ -133,7 +133,7 @@ def diagram(
     if described.machine:
         data |= {"parameter": parameter, "unit": symbol}
         counts = f"{len(found.points)} points, {len(found.branches)} branches"
-        lines = [f"{with_unit(parameter, symbol)} from {span[0]:g} to {span[1]:g}: {counts}"]
+        lines = [f"{headed(parameter, symbol)} from {span[0]:g} to {span[1]:g}: {counts}"]
         lines += [
             ", ".join(f"{k} {v}" for k, v in row.items() if v != "") for row in rows_of_points
         ]
@@ -146,11 +146,11 @@ def points_of(points: "tuple[jb.BifurcationPoint, ...]", unit: str, size: float)
     unit: that of the parameter, and size its size.
     """
     return {
-        with_unit("value", unit): [float(point.value) * size for point in points],
+        headed("value", unit): [float(point.value) * size for point in points],
         "kind": [point.kind for point in points],
         "belts": [" ".join(map(str, point.condition.belts_concerned)) for point in points],
         "type": [point.type for point in points],
-        with_unit("error", unit): [float(point.error) * size for point in points],
+        headed("error", unit): [float(point.error) * size for point in points],
         "status": [jb.Status(int(point.status)).name for point in points],
     }
 

@@ -58,7 +58,7 @@ class Place:
         return ValueError(f"{place}{must}{rest}" if place != self else f"{self}: {message}")
 
 
-def read(path: Path) -> dict[str, Any]:
+def read_file(path: Path) -> dict[str, Any]:
     """The content of a TOML file, tables of friction included."""
     try:
         with path.open("rb") as file:
@@ -99,16 +99,17 @@ def read_table(path: Path, place: Place | str = "file") -> tuple[list[float], li
         raise must("a CSV file", f"{path}: {error.strerror}") from None
     except UnicodeDecodeError:
         raise must("a CSV file", f"{path}, which is no text") from None
+    found: list[list[float]] = []
     for number, row in enumerate(rows, start=2):
         try:
-            row[:] = map(float, row)
+            found.append([float(word) for word in row])
         except (TypeError, ValueError):
             came = ", ".join(map(repr, row))
             raise must("a CSV file of numbers", f"{came} in line {number} of {path}") from None
-    return [row[0] for row in rows], [row[1] for row in rows]
+    return [speed for speed, _ in found], [mu for _, mu in found]
 
 
-def made(data: dict[str, Any], file: str) -> "jb.Machine | jb.Oscillator":
+def described_by(data: dict[str, Any], file: str) -> "jb.Machine | jb.Oscillator":
     """The machine or the oscillator that a file describes."""
     top = Place(file)
     belts = data.get("belts", [])
@@ -117,23 +118,23 @@ def made(data: dict[str, Any], file: str) -> "jb.Machine | jb.Oscillator":
     belt: Any = jb.PhysicalBelt if is_machine else jb.Belt
 
     def as_belts(tables: Any, place: Place) -> list[Any]:
-        return [_object(belt, table, at, parts) for table, at in _tables(tables, place)]
+        return [_object(belt, table, at, makers) for table, at in _tables(tables, place)]
 
     def as_forcing(tables: Any, place: Place) -> list[Any]:
-        return [_chosen("kind", table, at, "harmonic") for table, at in _tables(tables, place)]
+        return [_of_choice("kind", table, at, "harmonic") for table, at in _tables(tables, place)]
 
     waves = dict.fromkeys(("velocity", "load", "normal_force"), _as_wave)
-    parts: Parts = waves | {"friction": lambda table, at: _chosen("law", table, at)}
+    makers: Makers = waves | {"friction": lambda table, at: _of_choice("law", table, at)}
     whole: Any = jb.Machine if is_machine else jb.Oscillator
     return _object(whole, data, top, {"belts": as_belts, "forcing": as_forcing})
 
 
 #: What makes the objects in a table, by key.
-Parts = dict[str, Callable[[Any, Place], Any]]
+Makers = dict[str, Callable[[Any, Place], Any]]
 
 
 def _object(
-    kind: Callable, table: Any, place: Place, parts: Parts | None = None, choice: str = ""
+    kind: Callable, table: Any, place: Place, makers: Makers | None = None, choice: str = ""
 ) -> Any:
     """An object of a class from a table of its arguments.
 
@@ -153,7 +154,7 @@ def _object(
             value, at = table[one.name], place.at(one.name)
             if isinstance(value, list) and one.name not in LISTS:
                 raise at.must("be a number", repr(value))
-            make = (parts or {}).get(one.name)
+            make = (makers or {}).get(one.name)
             values[one.name] = make(value, at) if make else value
         elif one.default is one.empty:
             raise place.must(f"have {one.name}", ", ".join(table) or "nothing")
@@ -167,7 +168,7 @@ def _object(
 LISTS = ("belts", "forcing", "speeds", "coefficients")
 
 
-def _chosen(key: str, table: Any, place: Place, default: str | None = None) -> Any:
+def _of_choice(key: str, table: Any, place: Place, default: str | None = None) -> Any:
     """An object of the class that a word of its table chooses."""
     known = CLASSES_OF[key]
     if not isinstance(table, dict):
@@ -215,9 +216,10 @@ class FromFile:
         self.data = data
         # Known numbers stay known where a program is traced.
         with jax.ensure_compile_time_eval():
-            found: Any = made(data, file)
+            found: Any = described_by(data, file)
             self.machine = found if isinstance(found, jb.Machine) else None
-            self.own: jb.Oscillator = found if self.machine is None else found.oscillator
+            own: Any = found if self.machine is None else found.oscillator
+        self.own: jb.Oscillator = own
         names = names_of(self.own)
         if self.machine is None:
             short = {f"nu{i}": f"belts[{i}].velocity" for i in range(len(self.own.belts))}

@@ -28,7 +28,7 @@ import jaxbelt as jb
 
 from ..spelling import did_you_mean
 from .belts import LAWS, parse_belt, parts_of_belt, parts_of_force
-from .files import FromFile, changed, oscillator_of, read
+from .files import FromFile, changed, oscillator_of, read_file
 
 #: Arguments of the four classes of the paper, and their defaults.
 CLASSES = {
@@ -242,7 +242,7 @@ Json = Annotated[
 ]
 Interval = tuple[float, float]
 #: The start where none is given, dimensionless.
-START = (3.0, 0.0)
+FIRST_STATE = (3.0, 0.0)
 Start = Annotated[
     Interval | None,
     typer.Option(
@@ -291,7 +291,7 @@ class Description:
         if self.file is None:
             return None
         turn_on_float64()
-        return FromFile(read(self.file), str(self.file))
+        return FromFile(read_file(self.file), str(self.file))
 
     @property
     def machine(self) -> "jb.Machine | None":
@@ -317,7 +317,7 @@ class Description:
     def start(self, given: Interval | None) -> Interval:
         """The dimensionless start."""
         if given is None:
-            return START
+            return FIRST_STATE
         if not all(map(math.isfinite, given)):
             raise ValueError(f"start must be finite, got {given[0]} {given[1]}")
         return self.dimensionless(given[0], "length"), self.dimensionless(given[1], "velocity")

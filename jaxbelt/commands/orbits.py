@@ -25,9 +25,9 @@ from .options import (
     say,
     turn_on_float64,
 )
-from .tables import in_columns, with_unit, write_columns
+from .tables import headed, in_columns, write_columns
 
-QUANTITIES = ("x1", "x2")
+COORDINATES = ("x1", "x2")
 
 
 @describes()
@@ -87,8 +87,8 @@ def orbits(
     with plain_errors():
         if rows < 2:
             raise ValueError(f"rows must be at least 2, got {rows}")
-        if quantity not in QUANTITIES:
-            meant = did_you_mean(quantity, QUANTITIES)
+        if quantity not in COORDINATES:
+            meant = did_you_mean(quantity, COORDINATES)
             raise ValueError(f"quantity must be x1 or x2, got {quantity}{meant}")
         check_range("span", span)
         further = list(map(parse_start, also or ()))
@@ -126,7 +126,7 @@ def orbits(
         symbol = described.unit(parameter)[0]
         words = ", ".join(f"{count} {kind}" for kind, count in counts.items())
         ends = f"{span[0]:g} to {span[1]:g}"
-        lines = [f"{with_unit(parameter, symbol)} from {ends}, {len(kinds)} runs: {words}"]
+        lines = [f"{headed(parameter, symbol)} from {ends}, {len(kinds)} runs: {words}"]
         data["unit"] = symbol
     say(console, lines, written, as_json=as_json, data=data)
 

@@ -174,11 +174,11 @@ def simulate(
                 jb.plot_in_si(figure.axes, machine)
             save(figure, written[0])
         found = jb.in_si(trajectory, machine) if machine else None
-        at_samples, at_events = samples_of(trajectory, found), events_of(trajectory, found)
-        write_columns(at_samples, written[1])
-        write_columns(at_events, written[2])
+        columns = columns_of_samples(trajectory, found)
+        write_columns(columns, written[1])
+        write_columns(columns_of_events(trajectory, found), written[2])
     status = jb.Status(int(trajectory.status))
-    last = {name: as_json_value(column[-1]) for name, column in list(at_samples.items())[:3]}
+    last = {name: as_json_value(column[-1]) for name, column in list(columns.items())[:3]}
     data = {"status": status.name, **last, "events": len(trajectory.events.t)}
     lines = [repr(trajectory)]
     if machine:
@@ -190,7 +190,7 @@ def simulate(
         raise typer.Exit(1)
 
 
-def samples_of(trajectory: "jb.Trajectory", found: Any = None) -> dict[str, Any]:
+def columns_of_samples(trajectory: "jb.Trajectory", found: Any = None) -> dict[str, Any]:
     """Columns t, x1, x2 and the contact code of every belt, a row for each sample.
 
     found: the trajectory in SI units; then the columns have units, and there is the friction.
@@ -202,8 +202,8 @@ def samples_of(trajectory: "jb.Trajectory", found: Any = None) -> dict[str, Any]
     return columns | {f"mode{i}": mode for i, mode in enumerate(modes)}
 
 
-def events_of(trajectory: "jb.Trajectory", found: Any = None) -> dict[str, Any]:
-    """Columns t, x1, x2, kind and belt, a row for each event; found: as for `samples_of`."""
+def columns_of_events(trajectory: "jb.Trajectory", found: Any = None) -> dict[str, Any]:
+    """Columns t, x1, x2, kind and belt, a row for each event; found: as above."""
     events = trajectory.events
     columns = dict(t=events.t, x1=events.y[:, 0], x2=events.y[:, 1])
     if found is not None:

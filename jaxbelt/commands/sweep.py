@@ -182,7 +182,7 @@ def sweep(
         else:
             dataset = jb.sweep(make, values, **asked)
             if described.source and machine:
-                dataset = _in_si(dataset, described.source, own, y0)
+                dataset = _of_machine(dataset, described.source, own, y0)
             out.parent.mkdir(parents=True, exist_ok=True)
             # Version 3 of the format needs no library but SciPy.
             dataset.to_netcdf(out, engine="scipy")
@@ -193,7 +193,7 @@ def sweep(
     say(console, [repr(dataset)], written, as_json=as_json, data=_counts_as_data(dataset))
 
 
-def _in_si(dataset: Any, source: FromFile, axes: list[str], y0: tuple[float, float]) -> Any:
+def _of_machine(dataset: Any, source: FromFile, axes: list[str], y0: tuple[float, float]) -> Any:
     """The dataset of a machine in SI units, with the units of its axes and of its start.
 
     The parameters vary in the units of the machine in the file.

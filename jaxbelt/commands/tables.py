@@ -23,10 +23,10 @@ def write_columns(columns: Mapping[str, Any], path: Path) -> None:
 def in_columns(dataset: Any, names: Sequence[str]) -> dict[str, Any]:
     """Variables of a dataset in SI units as columns, whose names have the units: "x2 (m/s)"."""
     units = {name: dataset[name].attrs.get("units", "") for name in names}
-    return {with_unit(name, unit): dataset[name].values for name, unit in units.items()}
+    return {headed(name, unit): dataset[name].values for name, unit in units.items()}
 
 
-def with_unit(name: str, unit: str) -> str:
+def headed(name: str, unit: str) -> str:
     """A name with a unit such as "m s-1" behind it."""
     from ..plotting.style import in_fractions
 
