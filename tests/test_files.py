@@ -4,6 +4,7 @@ import csv
 import functools
 import json
 import tomllib
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -140,11 +141,12 @@ def test_a_dimensionless_file(tmp_path):
     assert (float(moved.belts[0].velocity), float(moved.forcing[0].frequency)) == (0.4, 1.6)
 
 
-def test_the_file_in_the_help_is_one(tmp_path):
-    _, _, text = str(simulate.__doc__).partition("```toml")
+def test_the_files_in_the_help_and_in_the_documentation_are_ones(tmp_path):
+    page = Path(__file__).parent.parent / "docs" / "scaling.md"
     written(tmp_path, "speed,mu\n0,0.5\n0.1,0.4\n", "mu.csv")
-    found = described(tmp_path, text.partition("```")[0])
-    assert isinstance(found.machine, jb.Machine) and len(found.machine.belts) == 2
+    for text in (str(simulate.__doc__), page.read_text(encoding="utf-8")):
+        found = described(tmp_path, text.partition("```toml")[2].partition("```")[0])
+        assert isinstance(found.machine, jb.Machine) and len(found.machine.belts) == 2
 
 
 @pytest.mark.parametrize("law", ["conti", "coulomb", "stribeck", "cubic"])
@@ -496,6 +498,7 @@ def test_a_forced_diagram_finds_the_points_of_the_python_call(tmp_path):
     assert column(rows, "value").tolist() == [float(point.value) for point in expected.points]
     branches = read(tmp_path / "diagram.csv")
     assert len(branches) == sum(map(len, expected.branches))
+    assert expected.plot().get_ylabel() == "amplitude of $x_1$"
     np.testing.assert_array_equal(
         column(branches, "x1_max"), np.concatenate([one.x1_max for one in expected.branches])
     )

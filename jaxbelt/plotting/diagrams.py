@@ -89,7 +89,7 @@ def _default_quantity(diagram: BifurcationDiagram) -> str:
     cycles = [branch for branch in diagram.branches if branch.kind == "cycle"]
     if not cycles:
         return "x1"
-    sticks = any(np.any(np.isfinite(branch.stick_velocities)) for branch in cycles)
+    sticks = any(np.any(np.isfinite(branch.stick_durations)) for branch in cycles)
     return "amplitude" if sticks else "x2"
 
 
