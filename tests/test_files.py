@@ -3,6 +3,7 @@
 import csv
 import functools
 import json
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -144,9 +145,11 @@ def test_a_dimensionless_file(tmp_path):
 def test_the_files_in_the_help_and_in_the_documentation_are_ones(tmp_path):
     page = Path(__file__).parent.parent / "docs" / "scaling.md"
     written(tmp_path, "speed,mu\n0,0.5\n0.1,0.4\n", "mu.csv")
-    for text in (str(simulate.__doc__), page.read_text(encoding="utf-8")):
-        found = described(tmp_path, text.partition("```toml")[2].partition("```")[0])
-        assert isinstance(found.machine, jb.Machine) and len(found.machine.belts) == 2
+    texts = str(simulate.__doc__) + page.read_text(encoding="utf-8")
+    blocks = re.findall(r"```toml\n(.+?)```", texts, re.S)
+    assert len(blocks) == 3
+    for block in blocks:
+        assert isinstance(described(tmp_path, block).machine, jb.Machine)
 
 
 @pytest.mark.parametrize("law", ["conti", "coulomb", "stribeck", "cubic"])
