@@ -80,12 +80,8 @@ def read_file(path: Path) -> dict[str, Any]:
     return data
 
 
-def read_table(path: Path, place: Place | str = "file") -> tuple[list[float], list[float]]:
+def read_table(path: Path, place: Place) -> tuple[list[float], list[float]]:
     """Speeds and coefficients from a CSV file with the columns speed and mu."""
-
-    def must(expected: str, came: str) -> ValueError:
-        return ValueError(f"{place} must be {expected}, got {came}")
-
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file, skipinitialspace=True)
@@ -93,19 +89,21 @@ def read_table(path: Path, place: Place | str = "file") -> tuple[list[float], li
             reader.fieldnames = names
             if not {*COLUMNS} <= {*names}:
                 came = f"{path} with {', '.join(names) or 'none'}"
-                raise must("a CSV file with the columns speed and mu", came)
-            rows = [[row[name] for name in COLUMNS] for row in reader]
+                raise place.must("be a CSV file with the columns speed and mu", came)
+            rows = [(reader.line_num, [row[name] for name in COLUMNS]) for row in reader]
     except OSError as error:
-        raise must("a CSV file", f"{path}: {error.strerror}") from None
+        raise place.must("be a CSV file", f"{path}: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise must("a CSV file", f"{path}, which is no text") from None
+        raise place.must("be a CSV file", f"{path}, which is no text") from None
     found: list[list[float]] = []
-    for number, row in enumerate(rows, start=2):
+    for line, row in rows:
         try:
             found.append([float(word) for word in row])
         except (TypeError, ValueError):
             came = ", ".join(map(repr, row))
-            raise must("a CSV file of numbers", f"{came} in line {number} of {path}") from None
+            raise place.must(
+                "be a CSV file of numbers", f"{came} in line {line} of {path}"
+            ) from None
     return [speed for speed, _ in found], [mu for _, mu in found]
 
 
