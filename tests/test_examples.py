@@ -30,7 +30,7 @@ PAGES = {
 }
 #: What these compile, few other tests need.
 SLOW = """
-AddingSliding AtEvents AtExtrema AtPhase AtSection AtTimes BasinFractions BasinStability Basins-
+AddingSliding AtEvents AtExtrema AtPhase AtSection AtTimes BasinFractions BasinStability
 BeltAtRest BifurcationCurve BifurcationDiagram BoundaryEquilibrium CornerCollision CrossingSliding
 Design-class EdgeExchange Exponents FatalShock Fit-class Fold FoldOfCycles GrazingEdge MeetingEdges
 OrbitDiagram PeriodDoubling PeriodicMotion Portrait-class PseudoHopf RegionMap SaddleConnection
@@ -39,7 +39,7 @@ bifurcation_curve bifurcation_diagram class design distance_to distance_to_basin
 find_cycle fit minimal_fatal_shock orbit_diagram plot_basins portrait region_map scan
 """.split()
 #: Long, and the only examples of what they show.
-FIRST = "Arcs", "explore", "laws", "simulate"
+FIRST = "Arcs", "Basins-class", "explore", "forcing", "laws", "simulate"
 
 
 def examples(path: Path) -> str:
