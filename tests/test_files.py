@@ -357,6 +357,14 @@ def test_what_is_wrong_with_a_table(tmp_path, table, sentence):
             "vary must be a path such as belts[0].friction.static or belts[0].normal_force, "
             "got belts[0].load",
         ),
+        (
+            "sweep belts[0].normal_force=-5:5:3",
+            "belts[0].normal_force in {file} must be >= 0, got -5.0",
+        ),
+        (
+            "orbits --vary belts[0].friction.kinetic --span 0.1 0.9",
+            "belts[0].friction.kinetic in {file} must be <= static = 0.5, got 0.9",
+        ),
         ("orbits --vary belts[0].velocity --also 1", "also must be X1,X2, two numbers, got '1'"),
         (
             "diagram --vary belts[0].velocity --span 0.1 0.2 --start 0 0",
@@ -378,9 +386,10 @@ def test_what_commands_refuse(tmp_path, words, sentence):
     out = tmp_path / "out"
     command, *rest = words.format(out).split()
     given = [] if "--out" in rest else ["--out", out if command != "sweep" else f"{out}.nc"]
-    result = run(command, *rest, "--file", written(tmp_path, MACHINE), *given)
+    file = written(tmp_path, MACHINE)
+    result = run(command, *rest, "--file", file, *given)
     assert (result.exit_code, result.stdout) == (2, "")
-    assert result.stderr.startswith(f"Error: {sentence.format(out)}")
+    assert result.stderr.startswith(f"Error: {sentence.format(out, file=file)}")
     assert result.stderr.count("\n") == 1
 
 

@@ -6,8 +6,10 @@ or a stiffness, else of `Oscillator` and `Belt`. A table in place of a velocity 
 all values; here their messages get the place in the file.
 """
 
+import copy
 import csv
 import inspect
+import re
 import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -200,6 +202,7 @@ class FromFile:
 
     Attributes:
         data: Content of the file.
+        file: Its path.
         machine: The machine; None for a dimensionless oscillator.
         own: The dimensionless oscillator.
         paths: Paths of parameters in `own`, by their paths in the file; without a machine also by
@@ -211,7 +214,7 @@ class FromFile:
 
         from ..model.parameters import names_of
 
-        self.data = data
+        self.data, self.file = data, file
         # Known numbers stay known where a program is traced.
         with jax.ensure_compile_time_eval():
             found: Any = described_by(data, file)
@@ -242,6 +245,20 @@ class FromFile:
 
         with jax.ensure_compile_time_eval():
             return unit_of(self.paths[name], self.own, self.machine.units)
+
+    def check(self, name: str, value: float) -> None:
+        """Raises in the words of the file where a value of a parameter is impossible."""
+        data = copy.deepcopy(self.data)
+        path = name if self.machine else self.paths[name]
+        here: Any = data
+        *steps, last = re.findall(r"[^.\[\]]+", path)
+        for step in steps:
+            if not step.isdecimal():
+                here = here[step]
+            elif isinstance(here, list):
+                here = here[int(step)]
+        here[last] = value
+        described_by(data, self.file)
 
     def at(self, **values: Any) -> "jb.Oscillator":
         """The dimensionless oscillator with parameters set, in the units of the file."""

@@ -379,9 +379,16 @@ class Description:
 
         from ..model.parameters import names_of
 
+        self.check_ends(name, span)
         osc, (_, size) = self.oscillator(), self.unit(name)
         place, (first, last) = names_of(osc).index(path), span
         return osc, lambda osc: jax.tree.leaves(osc)[place], (first / size, last / size)
+
+    def check_ends(self, name: str, values: Sequence[float]) -> None:
+        """Raises where the first or the last value of a parameter of a file is impossible."""
+        if self.source:
+            for value in (values[0], values[-1]):
+                self.source.check(name, value)
 
     def unit(self, name: str) -> tuple[str, float]:
         """Unit of a parameter of a machine, and the size of one unit of the oscillator in it."""

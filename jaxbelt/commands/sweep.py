@@ -168,6 +168,8 @@ def sweep(
         check_out(out.with_suffix(".png"))
         turn_on_float64()
         own = [name for name in values if name not in ("x1", "x2")]
+        for name in own:
+            described.check_ends(name, values[name])
         make = described.along(own)
         asked["t1"] = ENDS[observe] if t1 is None else described.dimensionless(t1, "time")
         for name, quantity in (("x1", "length"), ("x2", "velocity")):
