@@ -15,7 +15,6 @@ from .options import (
     Interval,
     Json,
     Out,
-    Start,
     as_json_value,
     check_range,
     describes,
@@ -51,7 +50,15 @@ def diagram(
         -0.7,
         0.7,
     ),
-    start: Start = None,
+    start: Annotated[
+        Interval | None,
+        typer.Option(
+            metavar="X1 X2",
+            help="With forcing: a start that leads to the motion in the middle of the span; of a "
+            "machine in m and m/s.",
+            show_default="from where one is found",
+        ),
+    ] = None,
     rows: Annotated[int, typer.Option(help="About how many values are computed.")] = 160,
     quantity: Annotated[
         str | None,

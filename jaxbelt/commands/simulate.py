@@ -65,7 +65,8 @@ def simulate(
     tolerance: Annotated[
         float | None,
         typer.Option(
-            help="Relative and absolute tolerance of the integrator.",
+            help="Relative and absolute tolerance of the integrator; of a machine the latter is in "
+            "max N / k.",
             show_default="1e-10, the absolute one of the oscillator's own size",
         ),
     ] = None,

@@ -86,7 +86,8 @@ def sweep(
     tolerance: Annotated[
         float | None,
         typer.Option(
-            help="Relative and absolute tolerance of the integrator.",
+            help="Relative and absolute tolerance of the integrator; of a machine the latter is in "
+            "max N / k.",
             show_default="1e-8, the absolute one of the oscillator's own size",
         ),
     ] = None,
