@@ -78,7 +78,7 @@ def orbits(
 
     - jaxbelt orbits --class b --nu1 0.35 --span 0 0.7
 
-    - jaxbelt orbits --belt 1,law=coulomb,static=1,kinetic=0.6 --damping 0 --force 0.5,1
+    - jaxbelt orbits --belt 1,law=coulomb,static=1,kinetic=0.6 --damping 0.1 --force 0.5,1
       --vary "forcing[0].frequency" --span 0.4 0.8 --also 0,0.5
 
     - jaxbelt orbits --file machine.toml --vary "belts[0].normal_force" --span 5 30
