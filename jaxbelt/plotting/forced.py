@@ -1,5 +1,7 @@
 """Periodic motions of forced oscillators, Lyapunov exponents, and circle maps."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
@@ -70,9 +72,12 @@ def plot_circle_map(found: CircleMap, ax: Axes | None = None) -> Axes:
     slopes = np.abs(slopes)
     breaks = np.abs(rise) > STEEPEST * step * np.maximum(slopes[1:], slopes[:-1])
     around = ~np.isclose(np.diff(y), rise, rtol=0.0, atol=1e-6)
-    gaps = np.flatnonzero(breaks | around) + 1
-    x, y = np.insert(x, gaps, np.nan), np.insert(y, gaps, np.nan)
-    ax.plot(x, y, color="black", linewidth=1.0, marker=".", markersize=1.6, label="next onset")
+    ends = breaks | around | ~np.isfinite(rise)
+    x, y = np.insert(x, at := np.flatnonzero(ends) + 1, np.nan), np.insert(y, at, np.nan)
+    ax.plot(x, y, color="black", linewidth=1.0, label="next onset")
+    alone = ends & np.roll(ends, 1)
+    style: dict[str, Any] = dict(color="black", markersize=2.0)
+    ax.plot(found.phases[alone], found.next_phases[alone], ".", **style)
     for is_stable, fill, word in ((True, "black", "stable"), (False, "white", "unstable")):
         places = found.fixed_points[found.stable == is_stable]
         if len(places):
@@ -88,6 +93,6 @@ def plot_circle_map(found: CircleMap, ax: Axes | None = None) -> Axes:
     ax.set_xticks(quarters, names)
     ax.set_yticks(quarters, names)
     ax.set(xlim=(0, turn), ylim=(0, turn), aspect="equal")
-    ax.set_xlabel(r"phase of slip onset $\varphi$")
-    ax.set_ylabel(r"phase of the next one $\varphi'$")
+    ax.set_xlabel(r"phase of slip onset $\varphi_n$")
+    ax.set_ylabel(r"phase of the next one $\varphi_{n+1}$")
     return ax

@@ -45,6 +45,8 @@ PARTS, CUTS = 32, 4
 #: Where the map is continuous its rise over an interval that was cut so often is a smaller part of
 #: what it was, even beside a square root; where it jumps it is not.
 STILL_RISES = 0.1
+#: Longest step with a tangent: the slopes are then good to some 1e-7 of themselves.
+LONGEST_WITH_TANGENT = 0.1
 #: The onset of a motion that was solved for is in the interval up to this phase.
 SAME_PHASE = 1e-6
 
@@ -199,7 +201,7 @@ def circle_map(
     check_oscillator(osc)
     check_clock(osc, "circle_map", "jb.find_cycle, as sticking cycles have the multiplier 0")
     check_belt(belt, len(osc.belts))
-    fits = limit is None or limit in (-1, 1) and not isinstance(limit, bool)
+    fits = limit is None or (limit in (-1, 1) and not isinstance(limit, bool))
     require_value(fits, "limit", "1, -1 or None", limit)
     n, periods = as_whole(n, "n", 2), as_whole(periods, "periods")
     require(periods <= PERIODS_AT_ONCE, "periods", f"at most {PERIODS_AT_ONCE}", periods)
@@ -251,7 +253,7 @@ def _is_apart(osc: Oscillator, i: int, belt: int) -> Any:
 # --- the state at slip onset ----------------------------------------------------------------------
 
 
-def _onset_state(osc: OwnOscillator, belt: int, limit: int, t: Array) -> tuple[Array, Array]:
+def _onset_state(osc: OwnOscillator, belt: int, limit: Any, t: Array) -> tuple[Array, Array]:
     """The state (x1, x2) of a mass that is stuck to a belt at its limit, at the time t."""
     now = at_time(osc, t)
     velocities = [one.velocity for one in now.belts]
@@ -267,27 +269,30 @@ def _onset_state(osc: OwnOscillator, belt: int, limit: int, t: Array) -> tuple[A
 
 
 @jit
-def _onset_states(osc: OwnOscillator, belt: int, limit: int, t: Array) -> Array:
+def _onset_states(osc: OwnOscillator, belt: int, limit: Array, t: Array) -> Array:
     """`_onset_state` at times [n], [2, n]."""
-    return jnp.stack(jax.vmap(lambda t: jnp.stack(_onset_state(osc, belt, limit, t)))(t), axis=1)
+    return jax.vmap(lambda t: jnp.stack(_onset_state(osc, belt, limit, t)), out_axes=1)(t)
 
 
 class _Seen(eqx.Module):
     """Memory of the observer, arrays [lanes].
 
-    growth: the tangent, by the time of the first onset; is_onset: whether the run begins with one;
-    elapsed: until the next one, NaN before it; slope: how much later that is, for each unit of time
-    that the first is later.
+    growth: the tangent, by the time of the first onset; sign: of the slip that begins with it, 0
+    where none does; elapsed: until the next one, NaN before it; slope: how much later that is, for
+    each unit of time that the first is later.
     """
 
     growth: Growth
-    is_onset: Array
+    sign: Array
     elapsed: Array
     slope: Array
 
 
 class NextOnset(Observer):
-    """From a slip onset to the next one at the same belt and limit, where the run ends."""
+    """From a slip onset to the next one at the same belt and limit, where the run ends.
+
+    Steps are short, for the tangent is known to a lower order than the state.
+    """
 
     variables: ClassVar[Mapping[str, Variable]] = {
         "elapsed": Variable("time from onset to onset"),
@@ -295,22 +300,25 @@ class NextOnset(Observer):
         "is_onset": Variable("whether the run begins with an onset", "bool"),
     }
     belt: int = eqx.field(static=True)
-    limit: int = eqx.field(static=True)
 
     def start(self, osc, lanes):
-        def tangent(osc, mode, t):
+        code = lanes.mode.codes[self.belt]
+        sign = jnp.where(jnp.abs(code) == 1, code, 0.0)
+
+        def tangent(osc, mode, sign, t):
             """How the state at a fixed time changes with that of the onset."""
             one = jnp.ones_like(t)
-            y, moved = jax.jvp(lambda t: _onset_state(osc, self.belt, self.limit, t), (t,), (one,))
+            y, moved = jax.jvp(lambda t: _onset_state(osc, self.belt, -sign, t), (t,), (one,))
             rates = field_at(osc, mode, (*y, t))
             return moved[0] - rates[0], moved[1] - rates[1]
 
-        d1, d2 = of_lanes(tangent, osc, lanes.mode, lanes.t)
+        d1, d2 = of_lanes(tangent, osc, lanes.mode, sign, lanes.t)
         growth = replace(Growth.none(lanes), d1=d1, d2=d2)
         nan = jnp.full_like(lanes.t, jnp.nan)
-        return _Seen(growth, lanes.mode.codes[self.belt] == -self.limit, nan, nan)
+        return _Seen(growth, sign, nan, nan)
 
     def follow(self, take_step, osc, window, ones, lanes, t1, rtol, atol):
+        window = replace(window, longest=jnp.minimum(window.longest, LONGEST_WITH_TANGENT))
         new = take_step(osc, window, ones, lanes, t1, rtol, atol)
         course = course_of_step(osc, lanes, new, ones)
         growth = grown(osc, lanes.memory.growth, lanes, course, course.duration, ones)
@@ -319,8 +327,8 @@ class NextOnset(Observer):
     def watch(self, osc, lanes, passage, ones, t1, tol):
         seen: _Seen = lanes.memory
         growth = seen.growth
-        at_limit = passage.number == 3 * len(osc.belts) + (self.limit < 0)
-        here = passage.fired & passage.before.stuck[self.belt] & at_limit & seen.is_onset
+        at_limit = passage.number == jnp.where(seen.sign < 0, 0, 1) + 3 * len(osc.belts)
+        here = passage.fired & passage.before.stuck[self.belt] & at_limit & (seen.sign != 0)
 
         def late():
             state = (passage.x1, passage.x2, passage.t), (growth.d1, growth.d2)
@@ -329,12 +337,12 @@ class NextOnset(Observer):
         slope = where_any(here, late, jnp.zeros_like(lanes.t)) * jnp.exp(growth.log)
         memory = _Seen(
             grown_past(osc, growth, lanes, passage, t1),
-            seen.is_onset,
+            seen.sign,
             jnp.where(here, passage.t - growth.began, seen.elapsed),
             jnp.where(here, slope, seen.slope),
         )
         forever = lanes.status == Status.STUCK_FOREVER.value
-        return replace(lanes, memory=memory, done=lanes.done | here | forever | ~seen.is_onset)
+        return replace(lanes, memory=memory, done=lanes.done | here | forever | (seen.sign == 0))
 
     def finish(self, osc, lanes):
         seen: _Seen = lanes.memory
@@ -342,7 +350,7 @@ class NextOnset(Observer):
         return {
             "elapsed": jnp.where(good, seen.elapsed, jnp.nan),
             "slope": jnp.where(good, seen.slope, jnp.nan),
-            "is_onset": seen.is_onset,
+            "is_onset": seen.sign != 0,
             "status": lanes.status,
         }
 
@@ -361,12 +369,12 @@ class _Mapping:
         self.leaves, structure = jax.tree.flatten(self.run)
         has_edge = bool(np.any(np.isfinite(np.asarray(edges(osc)))))
         mapped = (False,) * len(self.leaves)
-        self.program = Program(structure, mapped, NextOnset(belt, limit), has_edge, own_t0=True)
+        self.program = Program(structure, mapped, NextOnset(belt), has_edge, own_t0=True)
 
     def states(self, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Times in the first period, and the states at onset there, [2, n], in own units."""
-        t = phases / (2 * np.pi) * self.period
-        return t, np.asarray(_onset_states(self.own, self.belt, self.limit, jnp.asarray(t)))
+        t, limit = phases / (2 * np.pi) * self.period, jnp.asarray(float(self.limit))
+        return t, np.asarray(_onset_states(self.own, self.belt, limit, jnp.asarray(t)))
 
     def of_phases(self, phases: np.ndarray) -> dict[str, np.ndarray]:
         """turns: periods from onsets at phases to the next ones; slope and is_onset, [n]."""
