@@ -56,13 +56,12 @@ class CircleMap(eqx.Module):
 
     Attributes:
         phases: Phases of the clock, evenly spaced in [0, 2 pi), [n].
-        elapsed: Times from an onset at each of them to the next one, [n]; NaN where no onset is at
-            this phase, or none follows.
+        elapsed: Times from an onset at each of them to the next one (by `iterate` to a later one),
+            [n]; NaN where no onset is at this phase, or none follows.
         slopes: Derivatives of the map, [n].
         is_onset: At which phases a stick phase can end at this limit, [n].
-        motions: The periodic motions that are the fixed points of the map, in the order of their
-            phases.
-        fixed_points: Their phases of slip onset.
+        fixed_points: Phases that the map leads back to, increasing.
+        motions: The periodic motion of each of them.
         unsolved: Phases at which the map has a fixed point, too, by the signs beside it, for which
             Newton's method found no motion.
         period: Period of the clock.
@@ -75,8 +74,8 @@ class CircleMap(eqx.Module):
     elapsed: np.ndarray
     slopes: np.ndarray
     is_onset: np.ndarray
-    motions: tuple[PeriodicMotion, ...]
     fixed_points: np.ndarray
+    motions: tuple[PeriodicMotion, ...]
     unsolved: np.ndarray
     period: float
     belt: int = eqx.field(static=True)
@@ -98,8 +97,7 @@ class CircleMap(eqx.Module):
 
     @property
     def multipliers(self) -> np.ndarray:
-        """The derivatives of the map at its fixed points, each the multiplier of its motion that is
-        not 0."""
+        """The multiplier of the motion of each fixed point that is not 0: the map's slope there."""
         return np.array([float(one.multipliers[0].real) for one in self.motions])
 
     @property
@@ -110,9 +108,9 @@ class CircleMap(eqx.Module):
     def table(self) -> "pandas.DataFrame":
         """Returns a row for each phase and each fixed point, by phase.
 
-        Columns: phase, next_phase, periods (how often the clock passes the phase 0 until then),
-        slope (of the map; of a fixed point its multiplier), is_onset, fixed_point. NaN where no
-        onset follows.
+        Columns: phase, next_phase, periods (how often the clock passes the phase 0 until then; of a
+        fixed point those of its motion), slope (of a fixed point its multiplier), is_onset,
+        fixed_point. NaN where no onset follows.
         """
         fixed = np.repeat([False, True], [len(self.phases), len(self.motions)])
         columns = {
@@ -161,6 +159,7 @@ def circle_map(
     belt: int = 0,
     *,
     limit: int | None = None,
+    iterate: int = 1,
     n: int = 400,
     periods: int = PERIODS_AT_ONCE,
     rtol: ArrayLike = SIMULATION_TOLERANCE,
@@ -180,6 +179,8 @@ def circle_map(
         limit: 1 where stick phases end with needed = capacity, so that the mass runs ahead of the
             belt, -1 where needed = -capacity, and it falls behind. None: the limit to which a
             steady belt carries the mass, -1 where its (mean) velocity is positive, else 1.
+        iterate: With k the map is taken to the k-th next onset: its fixed points are then motions
+            that repeat after k onsets, too, each at k phases.
         n: Number of phases, evenly spaced, 0 among them.
         periods: After how many periods, 32 at most, a motion that has not come to an onset is given
             up.
@@ -203,7 +204,11 @@ def circle_map(
     check_belt(belt, len(osc.belts))
     fits = limit is None or (limit in (-1, 1) and not isinstance(limit, bool))
     require_value(fits, "limit", "1, -1 or None", limit)
-    n, periods = as_whole(n, "n", 2), as_whole(periods, "periods")
+    n, periods, iterate = (
+        as_whole(n, "n", 2),
+        as_whole(periods, "periods"),
+        as_whole(iterate, "iterate"),
+    )
     require(periods <= PERIODS_AT_ONCE, "periods", f"at most {PERIODS_AT_ONCE}", periods)
     numbers = {"rtol": as_positive(rtol, "rtol"), "atol": as_tolerance(atol, "atol")}
     velocity, load = (
@@ -220,17 +225,17 @@ def circle_map(
     )
     turns = turns_of(osc)
     limit = limit or (-1 if velocity > 0 else 1)
-    mapping = _Mapping(osc, turns, belt, limit, periods, numbers)
+    mapping = _Mapping(osc, turns, belt, limit, iterate, periods, numbers)
     phases = 2 * np.pi * np.arange(n) / n
     found = mapping.of_phases(phases)
-    motions, places, unsolved = mapping.fixed_points(phases, found["turns"])
+    places, motions, unsolved = mapping.fixed_points(phases, found["turns"])
     return CircleMap(
         phases=phases,
         elapsed=found["turns"] * mapping.period,
         slopes=found["slope"],
         is_onset=found["is_onset"],
-        motions=tuple(in_given_units(one, osc, mapping.own) for one in motions),
         fixed_points=places,
+        motions=tuple(in_given_units(one, osc, mapping.own) for one in motions),
         unsolved=unsolved,
         period=mapping.period,
         belt=belt,
@@ -361,9 +366,18 @@ class NextOnset(Observer):
 class _Mapping:
     """The map of a known oscillator, and its sweep; numbers: tolerances of it."""
 
-    def __init__(self, osc: Oscillator, turns: int, belt: int, limit: int, periods: int, numbers):
+    def __init__(
+        self,
+        osc: Oscillator,
+        turns: int,
+        belt: int,
+        limit: int,
+        iterate: int,
+        periods: int,
+        numbers,
+    ):
         self.turns, self.belt, self.limit = turns, belt, limit
-        self.periods, self.numbers = periods, numbers
+        self.iterate, self.periods, self.numbers = iterate, periods, numbers
         self.own, self.run = in_own_units(osc), in_units_of_run(osc)
         self.period = float(forcing_period(self.own, turns))
         self.leaves, structure = jax.tree.flatten(self.run)
@@ -378,60 +392,73 @@ class _Mapping:
 
     def of_phases(self, phases: np.ndarray) -> dict[str, np.ndarray]:
         """turns: periods from onsets at phases to the next ones; slope and is_onset, [n]."""
+        whole = self._once(phases)
+        for _ in range(self.iterate - 1):
+            found = self._once((phases + 2 * np.pi * whole["turns"]) % (2 * np.pi))
+            whole["turns"] = whole["turns"] + found["turns"]
+            whole["slope"] = whole["slope"] * found["slope"]
+        late = ~(whole["turns"] <= self.periods)
+        return {
+            **whole,
+            **{name: np.where(late, np.nan, whole[name]) for name in ("turns", "slope")},
+        }
+
+    def _once(self, phases: np.ndarray) -> dict[str, np.ndarray]:
         t, states = self.states(phases)
         rows = np.concatenate([np.asarray(self.run.units.length) * states, t[None]])[None]
-        t1 = (2 + self.periods) * self.period
         found = results_of(
             *(self.program, self.leaves, lambda first, last: rows[..., first:last], len(t)),
             **self.numbers,
-            t1=t1,
+            t1=(2 + self.periods) * self.period,
         )
-        turns = found["elapsed"] / self.period
-        late = ~(turns <= self.periods)
-        turns, slope = (np.where(late, np.nan, one) for one in (turns, found["slope"]))
-        return {"turns": turns, "slope": slope, "is_onset": found["is_onset"] > 0}
+        turns, is_onset = found["elapsed"] / self.period, found["is_onset"] > 0
+        return {"turns": turns, "slope": found["slope"], "is_onset": is_onset}
 
     def fixed_points(
         self, phases: np.ndarray, turns: np.ndarray
-    ) -> tuple[list[PeriodicMotion], np.ndarray, np.ndarray]:
-        """Motions, their phases in order, and phases of fixed points without one."""
-        motions, places, unsolved = [], [], []
+    ) -> tuple[np.ndarray, list[PeriodicMotion], np.ndarray]:
+        """Phases in order, their motions, and phases of fixed points without one."""
+        found: list[tuple[float, PeriodicMotion]] = []
+        unsolved = []
         ends = np.append(phases, 2 * np.pi), np.append(turns, turns[0])
         lows, highs, counts, rises, _ = _crossings(*(one[None] for one in ends))
         first = rises
         for _ in range(CUTS if len(lows) else 0):
             inner = lows[:, None] + (highs - lows)[:, None] * np.arange(PARTS + 1) / PARTS
-            found = self.of_phases(inner.ravel())["turns"].reshape(inner.shape)
-            lows, highs, counts, rises, rows = _crossings(inner, found, counts)
+            turns = self.of_phases(inner.ravel())["turns"].reshape(inner.shape)
+            lows, highs, counts, rises, rows = _crossings(inner, turns, counts)
             first = first[rows]
         for low, high, count, goes_on in zip(lows, highs, counts, rises < STILL_RISES * first):
             if not goes_on:
                 continue
-            motion, place = self._motion(0.5 * (low + high), int(count))
-            off = (place - low + SAME_PHASE) % (2 * np.pi)
-            if motion is not None and off <= high - low + 2 * SAME_PHASE:
-                motions.append(motion)
-                places.append(place)
+            motion, onsets = self._motion(0.5 * (low + high), int(count))
+            off = (onsets - low + SAME_PHASE) % (2 * np.pi)
+            here = onsets[off <= high - low + 2 * SAME_PHASE]
+            if motion is not None and len(here):
+                found.append((here[0], motion))
             else:
                 unsolved.append(low % (2 * np.pi))
-        order = np.argsort(places)
-        return [motions[i] for i in order], np.array(places)[order], np.array(unsolved)
+        found.sort(key=lambda one: one[0])
+        places = np.array([place for place, _ in found])
+        return places, [motion for _, motion in found], np.array(unsolved)
 
-    def _motion(self, phase: float, periods: int) -> tuple[PeriodicMotion | None, float]:
-        """The motion that repeats after so many periods near an onset at a phase, and the phase of
-        its only onset; None where there is none."""
+    def _motion(self, phase: float, periods: int) -> tuple[PeriodicMotion | None, np.ndarray]:
+        """The motion that repeats after so many periods near an onset at a phase, and the phases of
+        its onsets; None where there is none."""
         (t,), states = self.states(np.array([phase]))
         cuts = self.period * np.arange(1, PERIODS_AT_ONCE + 1)
         run = simulate(self.own, states[:, 0], cuts[-1], t0=t, ts=cuts)
         motion = periodic_from(self.own, run.ys[0], periods, self.turns)
-        if int(motion.status) != Status.OK or motion.periods != periods:
-            return None, np.nan
+        if int(motion.status) != Status.OK:
+            return None, np.zeros(0)
         used = np.asarray(motion.chain.used)
         codes = np.asarray(motion.chain.codes)[used][:, self.belt]
         ends = np.asarray(motion.chain.ends)[used] == Ends(len(self.own.belts)).onset
-        onsets = ends & (codes == STUCK) & (np.roll(codes, -1) == -self.limit)
-        times = np.roll(np.asarray(motion.unknowns)[used, 2], -1)[onsets]
-        return (motion, float(2 * np.pi * times[0] / self.period)) if len(times) == 1 else (None, 0)
+        here = ends & (codes == STUCK) & (np.roll(codes, -1) == -self.limit)
+        onsets = 2 * np.pi * np.roll(np.asarray(motion.unknowns)[used, 2], -1)[here] / self.period
+        # A motion with fewer onsets repeats after fewer periods.
+        fits = motion.periods * self.iterate == periods * len(onsets)
+        return (motion, onsets) if fits else (None, onsets)
 
 
 def _crossings(phases: np.ndarray, turns: np.ndarray, counts: Any = None) -> list[np.ndarray]:
