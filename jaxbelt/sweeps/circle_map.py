@@ -3,9 +3,9 @@
 At slip onset x2 is the belt's velocity, and x1 follows from needed = +-capacity: what is left of
 the state is the phase of the clock. So the motions of a forced oscillator that stick are orbits of
 a map of the circle. One sweep follows an onset at each of many phases to the next one at the same
-belt and limit, with the tangent along it, from which the map's slope follows; the map has jumps
-where a stick phase is skipped, and slopes without bound where one is about to be. Its fixed points
-are periodic motions, which `periodic` solves for.
+belt and limit, with the tangent along it, from which the map's slope follows. The map jumps where a
+stick phase is skipped, and its slope is singular beside a jump. Its fixed points are periodic
+motions, which `periodic` solves for.
 """
 
 from collections.abc import Mapping
@@ -97,7 +97,8 @@ class CircleMap(eqx.Module):
 
     @property
     def multipliers(self) -> np.ndarray:
-        """The multiplier of the motion of each fixed point that is not 0: the map's slope there."""
+        """The multiplier of each motion that is not 0: the slope of the map there, or of the first
+        of its iterates that leads back."""
         return np.array([float(one.multipliers[0].real) for one in self.motions])
 
     @property
@@ -171,7 +172,8 @@ def circle_map(
     whatever ways the mass slips, crosses, and sticks elsewhere in between. The phase is that of the
     clock, 2 pi t / T, T the common period of all forces, velocities and loads. Fixed points are
     motions that repeat after one onset; they are searched where the map crosses the diagonal
-    between two of the n phases, so a pair of them nearer to one another than these is missed.
+    between two of the n phases, so a pair of them nearer to one another than these is missed, and
+    so are most of those in an accumulation of jumps.
 
     Args:
         osc: An `Oscillator` with forcing.
