@@ -86,7 +86,9 @@ def plot_circle_map(found: CircleMap, ax: Axes | None = None) -> Axes:
     if not np.all(found.is_onset):
         edges = np.append(found.phases, turn) - 0.5 * step
         none = np.append(~found.is_onset, ~found.is_onset[0])
-        span = dict(transform=ax.get_xaxis_transform(), color="0.92", linewidth=0, zorder=0)
+        span: dict[str, Any] = dict(
+            transform=ax.get_xaxis_transform(), color="0.92", linewidth=0, zorder=0
+        )
         ax.fill_between(edges, 0, 1, where=none, step="post", **span, label="no onset")
     quarters = np.arange(5) * turn / 4
     names = ["0", r"$\pi/2$", r"$\pi$", r"$3\pi/2$", r"$2\pi$"]
@@ -94,5 +96,6 @@ def plot_circle_map(found: CircleMap, ax: Axes | None = None) -> Axes:
     ax.set_yticks(quarters, names)
     ax.set(xlim=(0, turn), ylim=(0, turn), aspect="equal")
     ax.set_xlabel(r"phase of slip onset $\varphi_n$")
-    ax.set_ylabel(r"phase of the next one $\varphi_{n+1}$")
+    word = "next one" if found.iterate == 1 else f"{found.iterate}-th next one"
+    ax.set_ylabel(rf"phase of the {word} $\varphi_{{n+{found.iterate}}}$")
     return ax

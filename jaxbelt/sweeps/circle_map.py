@@ -9,7 +9,7 @@ motions, which `periodic` solves for.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
@@ -19,19 +19,27 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
-from ..checks import as_positive, as_tolerance, as_whole, check_belt, require, require_value
+from ..checks import (
+    as_positive,
+    as_tolerance,
+    as_whole,
+    check_belt,
+    outside_of_traces,
+    require,
+    require_value,
+)
 from ..cycles.clocked import forcing_period, turns_of
 from ..cycles.periodic import PERIODS_AT_ONCE, PeriodicMotion, periodic_from
 from ..kernel.clocked import of_lanes
 from ..kernel.lanes import Observer, Program, Variable
 from ..model.forcing import Oscillating
 from ..model.instants import are_mates, field_at, is_faster
-from ..model.modes import BELOW, STUCK, Mode, capacity, edges, mode_acceleration
+from ..model.modes import BELOW, STUCK, Mode, capacity, edges, has_edges, mode_acceleration
 from ..model.oscillator import Oscillator, at_time, check_clock, check_oscillator
-from ..model.own_units import OwnOscillator, in_given_units, in_own_units, in_units_of_run
+from ..model.own_units import OwnOscillator, in_given_units, in_units_of_run
 from ..motion.arcs import Ends
 from ..motion.simulate import SIMULATION_TOLERANCE, simulate
-from ..numerics.compiling import jit, where_any
+from ..numerics.compiling import jit, power_of_two, where_any
 from ..results import Status, draw
 from ..tables import table_of
 from .strobes import Growth, course_of_step, delay_of_event, grown, grown_past
@@ -41,7 +49,9 @@ if TYPE_CHECKING:
     import pandas
 
 #: Parts into which an interval with a fixed point is cut, and how often: to 1e-6 of itself.
-PARTS, CUTS = 32, 4
+PARTS_OF_INTERVAL, CUTS = 32, 4
+#: States at onset are computed for so many phases at least.
+FEWEST_PHASES = 1024
 #: Where the map is continuous its rise over an interval that was cut so often is a smaller part of
 #: what it was, even beside a square root; where it jumps it is not.
 STILL_RISES = 0.1
@@ -68,6 +78,7 @@ class CircleMap(eqx.Module):
         belt: Number of the belt.
         limit: 1 where needed = capacity at the onsets, so that the mass runs ahead of the belt, -1
             where needed = -capacity, and it falls behind.
+        iterate: How many onsets later the next one is.
     """
 
     phases: np.ndarray
@@ -80,6 +91,7 @@ class CircleMap(eqx.Module):
     period: float
     belt: int = eqx.field(static=True)
     limit: int = eqx.field(static=True)
+    iterate: int = eqx.field(static=True, default=1)
 
     @property
     def next_phases(self) -> np.ndarray:
@@ -140,6 +152,7 @@ class CircleMap(eqx.Module):
 
     def __repr__(self) -> str:
         sign = "" if self.limit > 0 else "-"
+        iterate = f", iterate {self.iterate}" if self.iterate > 1 else ""
         known = int(np.sum(np.isfinite(self.elapsed)))
         rows = zip(self.fixed_points, self.motions, self.stable, self.multipliers, strict=True)
         told = "; ".join(
@@ -149,12 +162,13 @@ class CircleMap(eqx.Module):
         )
         missed = f", {len(self.unsolved)} not solved for" if len(self.unsolved) else ""
         return (
-            f"CircleMap(belt {self.belt}, needed = {sign}capacity, {known} of {len(self.phases)} "
-            f"phases lead on, fixed points: {told or 'none'}{missed})"
+            f"CircleMap(belt {self.belt}, needed = {sign}capacity{iterate}, {known} of "
+            f"{len(self.phases)} phases lead on, fixed points: {told or 'none'}{missed})"
         )
 
 
 @announced("circle_map")
+@outside_of_traces
 def circle_map(
     osc: Oscillator,
     belt: int = 0,
@@ -206,28 +220,23 @@ def circle_map(
     check_belt(belt, len(osc.belts))
     fits = limit is None or (limit in (-1, 1) and not isinstance(limit, bool))
     require_value(fits, "limit", "1, -1 or None", limit)
-    n, periods, iterate = (
-        as_whole(n, "n", 2),
-        as_whole(periods, "periods"),
-        as_whole(iterate, "iterate"),
-    )
+    n, iterate = as_whole(n, "n", 2), as_whole(iterate, "iterate")
+    periods = as_whole(periods, "periods")
     require(periods <= PERIODS_AT_ONCE, "periods", f"at most {PERIODS_AT_ONCE}", periods)
     numbers = {"rtol": as_positive(rtol, "rtol"), "atol": as_tolerance(atol, "atol")}
     velocity, load = (
         float(wave.mean if isinstance(wave, Oscillating) else wave)
         for wave in (osc.belts[belt].velocity, osc.belts[belt].load)
     )
-    held = load * float(osc.belts[belt].friction.static)
-    require(held > 0, "belt", "one with a load and static friction above 0", f"belt {belt}")
-    require(
-        all(_is_around(osc, i, belt) or _is_apart(osc, i, belt) for i in range(len(osc.belts))),
-        "belt",
-        "one within whose contact no contact of another belt begins or ends",
-        f"belt {belt}",
-    )
-    turns = turns_of(osc)
+    held, came = load * float(osc.belts[belt].friction.static), f"belt {belt}"
+    require(held > 0, "belt", "one with a load and static friction above 0", came)
+    others = range(len(osc.belts))
+    clear = all(_touches_wherever(osc, i, belt) or _keeps_off(osc, i, belt) for i in others)
+    expected = "one within whose contact no contact of another belt begins or ends"
+    require(clear, "belt", expected, came)
     limit = limit or (-1 if velocity > 0 else 1)
-    mapping = _Mapping(osc, turns, belt, limit, iterate, periods, numbers)
+    own, turns = in_units_of_run(osc), turns_of(osc)
+    mapping = _Mapping(own, turns, belt, limit, iterate, periods, numbers)
     phases = 2 * np.pi * np.arange(n) / n
     found = mapping.of_phases(phases)
     places, motions, unsolved = mapping.fixed_points(phases, found["turns"])
@@ -237,21 +246,22 @@ def circle_map(
         slopes=found["slope"],
         is_onset=found["is_onset"],
         fixed_points=places,
-        motions=tuple(in_given_units(one, osc, mapping.own) for one in motions),
+        motions=tuple(in_given_units(one, osc, own) for one in motions),
         unsolved=unsolved,
         period=mapping.period,
         belt=belt,
         limit=limit,
+        iterate=iterate,
     )
 
 
-def _is_around(osc: Oscillator, i: int, belt: int) -> Any:
+def _touches_wherever(osc: Oscillator, i: int, belt: int) -> Any:
     """Whether belt i touches wherever the belt does."""
     ends, n = edges(osc), len(osc.belts)
     return (ends[i] <= ends[belt]) & (ends[n + i] >= ends[n + belt])
 
 
-def _is_apart(osc: Oscillator, i: int, belt: int) -> Any:
+def _keeps_off(osc: Oscillator, i: int, belt: int) -> Any:
     """Whether belt i touches nowhere where the belt does."""
     ends, n = edges(osc), len(osc.belts)
     return (ends[i] >= ends[n + belt]) | (ends[n + i] <= ends[belt])
@@ -269,7 +279,7 @@ def _onset_state(osc: OwnOscillator, belt: int, limit: Any, t: Array) -> tuple[A
         rises = velocity - velocities[belt]
         sign = jnp.where(rises == 0, is_faster(osc, i, belt, t), jnp.sign(rises))
         touching = jnp.where(are_mates(osc, i, belt), STUCK, sign)
-        codes.append(jnp.where(_is_around(osc, i, belt), touching, BELOW))
+        codes.append(jnp.where(_touches_wherever(osc, i, belt), touching, BELOW))
     mode, x2 = Mode(tuple(codes)), velocities[belt] / osc.omega
     needed = mode_acceleration(now, mode, jnp.zeros_like(t), x2)  # at x1 = 0
     return needed - limit * capacity(now, mode), x2 + jnp.zeros_like(t)
@@ -281,7 +291,7 @@ def _onset_states(osc: OwnOscillator, belt: int, limit: Array, t: Array) -> Arra
     return jax.vmap(lambda t: jnp.stack(_onset_state(osc, belt, limit, t)), out_axes=1)(t)
 
 
-class _Seen(eqx.Module):
+class _ToNextOnset(eqx.Module):
     """Memory of the observer, arrays [lanes].
 
     growth: the tangent, by the time of the first onset; sign: of the slip that begins with it, 0
@@ -304,7 +314,7 @@ class NextOnset(Observer):
     variables: ClassVar[Mapping[str, Variable]] = {
         "elapsed": Variable("time from onset to onset"),
         "slope": Variable("its derivative by the time of the first, and 1"),
-        "is_onset": Variable("whether the run begins with an onset", "bool"),
+        "sign": Variable("of the slip that the run begins with, 0 where it sticks", "int8"),
     }
     belt: int = eqx.field(static=True)
 
@@ -322,7 +332,7 @@ class NextOnset(Observer):
         d1, d2 = of_lanes(tangent, osc, lanes.mode, sign, lanes.t)
         growth = replace(Growth.none(lanes), d1=d1, d2=d2)
         nan = jnp.full_like(lanes.t, jnp.nan)
-        return _Seen(growth, sign, nan, nan)
+        return _ToNextOnset(growth, sign, nan, nan)
 
     def follow(self, take_step, osc, window, ones, lanes, t1, rtol, atol):
         window = replace(window, longest=jnp.minimum(window.longest, LONGEST_WITH_TANGENT))
@@ -332,7 +342,7 @@ class NextOnset(Observer):
         return replace(new, memory=replace(lanes.memory, growth=growth))
 
     def watch(self, osc, lanes, passage, ones, t1, tol):
-        seen: _Seen = lanes.memory
+        seen: _ToNextOnset = lanes.memory
         growth = seen.growth
         at_limit = passage.number == jnp.where(seen.sign < 0, 0, 1) + 3 * len(osc.belts)
         here = passage.fired & passage.before.stuck[self.belt] & at_limit & (seen.sign != 0)
@@ -342,7 +352,7 @@ class NextOnset(Observer):
             return of_lanes(delay_of_event, osc, passage.before, passage.number, *state)
 
         slope = where_any(here, late, jnp.zeros_like(lanes.t)) * jnp.exp(growth.log)
-        memory = _Seen(
+        memory = _ToNextOnset(
             grown_past(osc, growth, lanes, passage, t1),
             seen.sign,
             jnp.where(here, passage.t - growth.began, seen.elapsed),
@@ -352,12 +362,12 @@ class NextOnset(Observer):
         return replace(lanes, memory=memory, done=lanes.done | here | forever | (seen.sign == 0))
 
     def finish(self, osc, lanes):
-        seen: _Seen = lanes.memory
+        seen: _ToNextOnset = lanes.memory
         good = lanes.status == Status.OK.value
         return {
             "elapsed": jnp.where(good, seen.elapsed, jnp.nan),
             "slope": jnp.where(good, seen.slope, jnp.nan),
-            "is_onset": seen.sign != 0,
+            "sign": seen.sign,
             "status": lanes.status,
         }
 
@@ -365,32 +375,29 @@ class NextOnset(Observer):
 # --- the map and its fixed points -----------------------------------------------------------------
 
 
+@dataclass(frozen=True, eq=False)
 class _Mapping:
-    """The map of a known oscillator, and its sweep; numbers: tolerances of it."""
+    """The map of a known oscillator in its own units; numbers: tolerances of its sweep."""
 
-    def __init__(
-        self,
-        osc: Oscillator,
-        turns: int,
-        belt: int,
-        limit: int,
-        iterate: int,
-        periods: int,
-        numbers,
-    ):
-        self.turns, self.belt, self.limit = turns, belt, limit
-        self.iterate, self.periods, self.numbers = iterate, periods, numbers
-        self.own, self.run = in_own_units(osc), in_units_of_run(osc)
-        self.period = float(forcing_period(self.own, turns))
-        self.leaves, structure = jax.tree.flatten(self.run)
-        has_edge = bool(np.any(np.isfinite(np.asarray(edges(osc)))))
-        mapped = (False,) * len(self.leaves)
-        self.program = Program(structure, mapped, NextOnset(belt), has_edge, own_t0=True)
+    own: OwnOscillator
+    turns: int
+    belt: int
+    limit: int
+    iterate: int
+    periods: int
+    numbers: dict[str, Any]
+
+    @property
+    def period(self) -> float:
+        """The period of the clock."""
+        return float(forcing_period(self.own, self.turns))
 
     def states(self, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Times in the first period, and the states at onset there, [2, n], in own units."""
+        """Times in the first period, and the states at onset there, [2, n]."""
         t, limit = phases / (2 * np.pi) * self.period, jnp.asarray(float(self.limit))
-        return t, np.asarray(_onset_states(self.own, self.belt, limit, jnp.asarray(t)))
+        # A power of two of them, for few programs.
+        padded = jnp.asarray(np.resize(t, power_of_two(len(t), FEWEST_PHASES)))
+        return t, np.asarray(_onset_states(self.own, self.belt, limit, padded))[:, : len(t)]
 
     def of_phases(self, phases: np.ndarray) -> dict[str, np.ndarray]:
         """turns: periods from onsets at phases to the next ones; slope and is_onset, [n]."""
@@ -400,21 +407,23 @@ class _Mapping:
             whole["turns"] = whole["turns"] + found["turns"]
             whole["slope"] = whole["slope"] * found["slope"]
         late = ~(whole["turns"] <= self.periods)
-        return {
-            **whole,
-            **{name: np.where(late, np.nan, whole[name]) for name in ("turns", "slope")},
-        }
+        whole["turns"][late] = whole["slope"][late] = np.nan
+        return whole
 
     def _once(self, phases: np.ndarray) -> dict[str, np.ndarray]:
+        leaves, structure = jax.tree.flatten(self.own)
+        mapped, has_edge = (False,) * len(leaves), has_edges(self.own)
+        program = Program(structure, mapped, NextOnset(self.belt), has_edge, own_t0=True)
         t, states = self.states(phases)
-        rows = np.concatenate([np.asarray(self.run.units.length) * states, t[None]])[None]
+        rows = np.concatenate([np.asarray(self.own.units.length) * states, t[None]])[None]
         found = results_of(
-            *(self.program, self.leaves, lambda first, last: rows[..., first:last], len(t)),
+            *(program, leaves, lambda first, last: rows[..., first:last], len(t)),
             **self.numbers,
             t1=(2 + self.periods) * self.period,
         )
-        turns, is_onset = found["elapsed"] / self.period, found["is_onset"] > 0
-        return {"turns": turns, "slope": found["slope"], "is_onset": is_onset}
+        is_onset = found["sign"] == -self.limit
+        turns, slope = (np.where(is_onset, found[name], np.nan) for name in ("elapsed", "slope"))
+        return {"turns": turns / self.period, "slope": slope, "is_onset": is_onset}
 
     def fixed_points(
         self, phases: np.ndarray, turns: np.ndarray
@@ -425,8 +434,11 @@ class _Mapping:
         ends = np.append(phases, 2 * np.pi), np.append(turns, turns[0])
         lows, highs, counts, rises, _ = _crossings(*(one[None] for one in ends))
         first = rises
-        for _ in range(CUTS if len(lows) else 0):
-            inner = lows[:, None] + (highs - lows)[:, None] * np.arange(PARTS + 1) / PARTS
+        shares = np.arange(PARTS_OF_INTERVAL + 1) / PARTS_OF_INTERVAL
+        for _ in range(CUTS):
+            if not len(lows):
+                break
+            inner = lows[:, None] + (highs - lows)[:, None] * shares
             turns = self.of_phases(inner.ravel())["turns"].reshape(inner.shape)
             lows, highs, counts, rises, rows = _crossings(inner, turns, counts)
             first = first[rows]
@@ -450,7 +462,10 @@ class _Mapping:
         (t,), states = self.states(np.array([phase]))
         cuts = self.period * np.arange(1, PERIODS_AT_ONCE + 1)
         run = simulate(self.own, states[:, 0], cuts[-1], t0=t, ts=cuts)
-        motion = periodic_from(self.own, run.ys[0], periods, self.turns)
+        start = np.asarray(run.ys[0])
+        if not np.all(np.isfinite(start)):
+            return None, np.zeros(0)
+        motion = periodic_from(self.own, start, periods, self.turns)
         if int(motion.status) != Status.OK:
             return None, np.zeros(0)
         used = np.asarray(motion.chain.used)
