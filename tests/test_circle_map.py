@@ -119,6 +119,18 @@ def test_a_motion_with_three_onsets_is_a_cycle_of_three_phases():
     np.testing.assert_allclose(thrice.multipliers[thrice.stable], multiplier, rtol=1e-9)
 
 
+@pytest.mark.slow(first=True)
+def test_a_fixed_point_between_a_phase_and_the_end_of_a_branch_is_found():
+    """The mass sticks for 1.4e-4 only; the branch ends before the next of 400 phases."""
+    osc = jb.Oscillator(0.2, (conti(0.1),), forcing=jb.Harmonic(1.5, 2.1))
+    motion = jb.find_cycle(osc, (0.5, 0.0))
+    assert 0 < float(motion.stick_durations[0]) < 1e-3
+    found = jb.circle_map(osc)
+    assert found.stable.tolist() == [True]
+    multiplier = float(motion.multipliers[0].real)
+    assert found.multipliers[0] == pytest.approx(multiplier, abs=1e-9)
+
+
 # --- points of the map ----------------------------------------------------------------------------
 
 

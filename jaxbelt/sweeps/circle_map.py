@@ -50,6 +50,9 @@ if TYPE_CHECKING:
 
 #: Parts into which an interval with a fixed point is cut, and how often: to 1e-6 of itself.
 PARTS_OF_INTERVAL, CUTS = 32, 4
+#: Where the periods to the next onset differ by more from one phase to the next, or one of the two
+#: leads nowhere, fixed points are searched between finer phases.
+ROUGH = 0.02
 #: States at onset are computed for so many phases at least.
 FEWEST_PHASES = 1024
 #: Where the map is continuous its rise over an interval that was cut so often is a smaller part of
@@ -186,8 +189,9 @@ def circle_map(
     whatever ways the mass slips, crosses, and sticks elsewhere in between. The phase is that of the
     clock, 2 pi t / T, T the common period of all forces, velocities and loads. Fixed points are
     motions that repeat after one onset; they are searched where the map crosses the diagonal
-    between two of the n phases, so a pair of them nearer to one another than these is missed, and
-    so are most of those in an accumulation of jumps.
+    between two of the n phases, or, where it is steep or jumps, between phases a thirty-second of
+    that apart. So a pair of them nearer to one another is missed, and so are most of those in an
+    accumulation of jumps.
 
     Args:
         osc: An `Oscillator` with forcing.
@@ -431,16 +435,20 @@ class _Mapping:
         """Phases in order, their motions, and phases of fixed points without one."""
         found: list[tuple[float, PeriodicMotion]] = []
         unsolved = []
-        ends = np.append(phases, 2 * np.pi), np.append(turns, turns[0])
-        lows, highs, counts, rises, _ = _crossings(*(one[None] for one in ends))
-        first = rises
-        shares = np.arange(PARTS_OF_INTERVAL + 1) / PARTS_OF_INTERVAL
+        ends = (np.append(phases, 2 * np.pi), np.append(turns, turns[0]))
+        ends = [np.stack([one[:-1], one[1:]], axis=1) for one in ends]
+        known = np.isfinite(ends[1])
+        # A branch may begin or end behind a fixed point and before the next phase.
+        rough = np.any(known, axis=1) & ~(np.abs(np.ptp(ends[1], axis=1)) <= ROUGH)
+        parts = (
+            _crossings(*(one[~rough] for one in ends)),
+            _crossings(*self._between(*ends[0][rough].T)),
+        )
+        lows, highs, counts, first, _ = (np.concatenate(both) for both in zip(*parts))
+        rises = first
         for _ in range(CUTS):
-            if not len(lows):
-                break
-            inner = lows[:, None] + (highs - lows)[:, None] * shares
-            turns = self.of_phases(inner.ravel())["turns"].reshape(inner.shape)
-            lows, highs, counts, rises, rows = _crossings(inner, turns, counts)
+            inner = self._between(lows, highs)
+            lows, highs, counts, rises, rows = _crossings(*inner, counts)
             first = first[rows]
         for low, high, count, goes_on in zip(lows, highs, counts, rises < STILL_RISES * first):
             if not goes_on:
@@ -455,6 +463,12 @@ class _Mapping:
         found.sort(key=lambda one: one[0])
         places = np.array([place for place, _ in found])
         return places, [motion for _, motion in found], np.array(unsolved)
+
+    def _between(self, lows: np.ndarray, highs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Phases from low to high ones, and periods from them to the next onsets, [rows, k]."""
+        shares = np.arange(PARTS_OF_INTERVAL + 1) / PARTS_OF_INTERVAL
+        inner = lows[:, None] + (highs - lows)[:, None] * shares
+        return inner, self.of_phases(inner.ravel())["turns"].reshape(inner.shape)
 
     def _motion(self, phase: float, periods: int) -> tuple[PeriodicMotion | None, np.ndarray]:
         """The motion that repeats after so many periods near an onset at a phase, and the phases of
