@@ -202,6 +202,7 @@ HEAVY = jb.Oscillator(
 HEAVY_END = (-0.5000461133112228, -0.01132346337252263)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("tol", [1e-6, 1e-8, 1e-10])
 def test_no_event_of_a_heavy_belt_is_missed(tol):
     """At 1e-6 and 1e-8 there were 77 events. An error at an edge counts 235 bounces long."""

@@ -22,7 +22,8 @@ def class_b(nu):
     return jb.presets.class_b(nu, 0.35)
 
 
-# (class, condition, value computed twice independently to about 1e-11)
+# (class, condition, value computed twice independently to about 1e-11); that `jaxbelt reproduce`
+# has the same is in test_cli.py
 TABLE = [
     (jb.presets.class_a, jb.NonsmoothFold(0), 0.267134534361),
     (jb.presets.class_a, jb.Hopf(), (np.sqrt(8) - 1) / 10),
@@ -36,7 +37,8 @@ TABLE = [
 ]
 
 
-@pytest.mark.parametrize("offset", [pytest.param(-0.02, marks=pytest.mark.slow(first=True)), 0.02])
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("offset", [-0.02, 0.02])
 @pytest.mark.parametrize(("make", "condition", "exact"), TABLE)
 def test_the_papers_table(make, condition, exact, offset):
     point = jb.refine(condition, make(exact + offset), where=nu0)
@@ -94,6 +96,7 @@ def at_nu0(osc, nu):
     )
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(("guess", "exact"), [(0.23, (np.sqrt(8) - 1) / 10), (0.25, 0.3)])
 def test_the_nearer_of_two_fixed_points_that_change(guess, exact):
     """One on either side of an edge beyond which friction is twice as strong."""
@@ -432,6 +435,7 @@ def test_grazing_of_either_of_two_belts_of_one_velocity(mirrored):
     assert float(point.value) == pytest.approx(0.695676900485494, abs=1e-10)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("scale", [0.0042])
 def test_a_fold_of_a_law_with_a_narrow_layer(scale):
     """The layer holds the orbit until it comes to slip onset: forwards no number leads there."""

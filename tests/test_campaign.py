@@ -49,6 +49,7 @@ def to_oracle(osc):
 # ---------------------------------------------------------------- the engine: closed forms
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("v", [0.1, -0.4])
 def test_stick_slip_is_a_circle_and_a_straight_line(v):
     # Onset at x1 = mus, a circle around mud, back at x2 = v a distance d = mus - mud before it.

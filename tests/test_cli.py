@@ -154,6 +154,7 @@ def test_bad_forces_are_told(force, message):
         Description(force=[force]).check()
 
 
+@pytest.mark.slow(first=True)
 def test_a_forced_run_is_written(tmp_path):
     belt = ["--belt", "1.0,law=coulomb,static=1,kinetic=0.6", "--force", "0.9,1.3"]
     out = tmp_path / "run"
@@ -385,6 +386,11 @@ def test_critical_values_json(values):
     hopf = (np.sqrt(4 / (0.5 - 4 / 4.5**2)) - 1) / 10
     assert computed["b", "nu_gamma"] == pytest.approx(hopf, abs=1e-14)
     assert computed["b", "nu_epsilon"] == pytest.approx(-hopf, abs=1e-14)
+    # Computed twice by other programs, to about 1e-11.
+    others = [0.267134534361, 0.538734800481, -0.455724862289, -0.561302406210]
+    keys = ("a", "nu_alpha"), ("b", "nu_alpha"), ("b", "nu_zeta"), ("b", "nu_eta")
+    np.testing.assert_allclose([computed[key] for key in keys], others, rtol=0, atol=1e-11)
+    assert computed["b", "nu_beta"] == 0.35 and computed["b", "nu_delta"] == 0
     for row in rows:
         assert row["residual"] <= 1e-11
         assert 1 <= row["iterations"] <= 8

@@ -205,6 +205,7 @@ def test_labels_of_round_numbers(structure):
 
 
 # Around a hard push it takes more loops than `find_cycle` follows, and says so.
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("name", [name for name in CASES if name != "hard push"])
 def test_find_cycle_settles_on_round_numbers(name):
     osc, y0 = CASES[name]

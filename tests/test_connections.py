@@ -225,6 +225,7 @@ def test_no_courses_where_orbits_depend_on_the_parameter_with_jumps():
     assert courses(with_law(jumps, 0.5)) == courses(with_law(law, 0.0)) == [(), ()]
 
 
+@pytest.mark.slow(first=True)
 def test_no_saddle_where_a_fixed_point_lies_on_the_edge():
     """On round numbers, but for rounding: it pushes to no side, whatever the damping is; and as the
     other side pushes away, nothing changes where its trace vanishes."""

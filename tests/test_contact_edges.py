@@ -339,6 +339,7 @@ def test_a_small_cycle_that_sticks_until_the_edge():
         assert np.sum(loop.durations) == pytest.approx(small.period, abs=1e-6)
 
 
+@pytest.mark.slow(first=True)
 def test_the_onset_of_a_belt_that_touches_on_the_right_only():
     """Beside the cycle on belt 0: that on belt 1 alone ends in its fold, the paper's class (a)."""
     points = jb.scan(jb.presets.class_c(-0.246, 0.3225, 0.3141), nu1, (0.23, 0.3), resolution=8)
@@ -446,6 +447,7 @@ def test_the_end_of_a_segment_on_an_edge():
     assert point.value == pytest.approx(pull - 1, abs=1e-14) and point.status == Status.OK
 
 
+@pytest.mark.slow(first=True)
 def test_an_exchange_where_the_edge_of_one_belt_is_passed():
     """Below, the mass sticks to belt 0, loses it at its edge, and sticks to belt 1; above, to belt
     1 all the way. In the limit the orbit is the same."""
@@ -601,6 +603,7 @@ def test_where_one_type_of_boundary_equilibrium_turns_into_the_other():
     assert sorted(types) == ["annihilation", "persistence"]
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(
     ("velocity", "kind"), [(0.0, "persistence"), (-1.0, "annihilation")], ids=["held", "pushed"]
 )

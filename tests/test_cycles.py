@@ -93,6 +93,7 @@ def _steep(name, scale):
     return jb.Stribeck(1.5, 1.0, scale), oracle.stribeck(1.5, 1.0, scale)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(
     ("name", "nu", "scale"),
     [

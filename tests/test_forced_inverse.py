@@ -237,6 +237,7 @@ def amplitude_at(frequency):
     return jb.amplitude(jb.find_cycle(den_hartog(frequency), (0.0, 0.0)))
 
 
+@pytest.mark.slow(first=True)
 def test_extremes_and_their_derivatives_are_those_of_the_closed_form():
     motion = jb.find_cycle(den_hartog(0.6), (0.0, 0.0))
     X, _, state = closed_form(0.6)

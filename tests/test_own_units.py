@@ -84,6 +84,7 @@ def test_motions(units):
     same(run.ys, again.ys, length)
 
 
+@pytest.mark.slow(first=True)
 def test_derivatives_and_batches(units):
     length, omega = units
 
@@ -100,6 +101,7 @@ def test_derivatives_and_batches(units):
         )
 
 
+@pytest.mark.slow(first=True)
 def test_cycles_portraits_and_shocks(units):
     length, omega = units
     osc, other = oscillator(), oscillator(length=length, omega=omega)
@@ -120,6 +122,7 @@ def test_cycles_portraits_and_shocks(units):
     same_tables(shock.at_phases(4), again.at_phases(4), length, length * omega)
 
 
+@pytest.mark.slow(first=True)
 def test_points_and_curves(units):
     length, omega = units
     speed = length * omega
@@ -161,6 +164,7 @@ class Work:
         return jnp.sum(motion.forces) * motion.x2
 
 
+@pytest.mark.slow(first=True)
 def test_sweeps(units):
     length, omega = units
     speed = length * omega
@@ -305,6 +309,7 @@ def test_a_newton_and_a_stiff_spring_in_metres():
     assert int(jb.unstable_cycle(osc).status) == jb.Status.OK
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("omega", [10.0, 100.0, 1000.0])
 def test_refine_at_other_frequencies(omega):
     point = jb.refine(jb.NonsmoothFold(1), oscillator(0.52, omega=omega), where=nu0)

@@ -55,6 +55,7 @@ def test_find_cycle_finds_the_number_of_periods(smooth, sticking):
     assert float(smooth.stick_durations[0]) == 0.0
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("frequency", [1.715, 1.725, 1.8])
 def test_the_number_of_periods_is_the_least(frequency):
     motion = jb.find_cycle(bkn(frequency), (0.5, 0.0))
@@ -98,6 +99,7 @@ def test_samples_begin_and_end_at_the_start(sticking):
     assert states[50] == pytest.approx(np.asarray(sticking.starts[1]), abs=1e-10)
 
 
+@pytest.mark.slow(first=True)
 def test_extrema_are_those_of_samples(smooth, sticking):
     # A belt that turns back while the mass sticks to it: x1 is largest inside of a stick phase.
     belt = jb.Belt(jb.Oscillating(0.0, 0.5, 1.0), jb.Coulomb(1.0, 1.0))
@@ -130,6 +132,7 @@ def test_functionals_of_a_forced_motion(sticking):
             functional(sticking)
 
 
+@pytest.mark.slow(first=True)
 def test_extrema_of_a_batch(sticking):
     values = jnp.array([1.678, 1.68])
     motions = jax.vmap(lambda frequency: sticking.at(bkn(frequency)))(values)
@@ -137,6 +140,7 @@ def test_extrema_of_a_batch(sticking):
     assert motions.x1_max[1] == pytest.approx(float(sticking.x1_max), abs=1e-11)
 
 
+@pytest.mark.slow(first=True)
 def test_derivatives_are_those_of_the_engine(sticking):
     def start(frequency):
         osc = bkn_of_engine(frequency)
@@ -148,6 +152,7 @@ def test_derivatives_are_those_of_the_engine(sticking):
     assert np.asarray(slope) == pytest.approx((4 * near - far) / 3, abs=1e-7)
 
 
+@pytest.mark.slow(first=True)
 def test_at_follows_a_motion_to_other_oscillators(sticking):
     values = jnp.array([1.678, 1.68, 1.682])
     moved = jax.vmap(lambda frequency: sticking.at(bkn(frequency)).start)(values)
@@ -335,6 +340,7 @@ def test_den_hartog_without_stops():
     assert [kind.name for kind, _ in motion.signature] == ["CROSS", "CROSS"]
 
 
+@pytest.mark.slow(first=True)
 def test_the_amplitude_and_its_derivatives_are_those_of_the_closed_form():
     def height(frequency, friction):
         return jb.amplitude(jb.find_cycle(den_hartog(frequency, friction), (0.0, 0.0)))

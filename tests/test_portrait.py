@@ -466,6 +466,7 @@ def test_one_top_is_not_two_where_two_belts_at_rest_touch():
         assert one.end == "outside" and np.max(np.abs(np.asarray(one.ys))) > told.reach
 
 
+@pytest.mark.slow(first=True)
 def test_rounding_beside_a_pseudo_focus_is_no_gap():
     laws = (
         jb.Conti(1.24132057137, 1.14210672961, 14.2554871992),
@@ -480,6 +481,7 @@ def test_rounding_beside_a_pseudo_focus_is_no_gap():
     assert told.status == jb.Status.OK and not len(told.gaps)
 
 
+@pytest.mark.slow(first=True)
 def test_separatrices_come_from_out_of_reach_where_loops_hardly_grow():
     """A loop passes a dozen edges and boundaries, and grows by a seventh."""
     belts = (

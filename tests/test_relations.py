@@ -468,6 +468,7 @@ def original_cycle(seed: int, number: int) -> list[float]:
     return numbers_of(jb.find_cycle(*cases(seed)[number]))
 
 
+@pytest.mark.slow
 @seeds
 @two_belts_by_day
 def test_an_image_has_the_same_cycle(image_of, seed):
@@ -607,6 +608,7 @@ def test_an_image_ends_there_too(image_of, seed):
         np.testing.assert_array_equal(found.n_events.values[counts], whole.n_events.values[counts])
 
 
+@pytest.mark.slow
 @seeds
 @two_belts_by_day
 def test_an_image_has_the_same_attractors(image_of, seed):

@@ -69,6 +69,7 @@ def test_a_focus_that_repels_on_one_side_only():
     assert point.condition == AT_REST and point.value == 0
 
 
+@pytest.mark.slow(first=True)
 def test_a_focus_that_attracts_on_both_sides():
     damping = 3.0
     assert rate(-1e-6, damping) < 0 and rate(1e-6, damping) < 0

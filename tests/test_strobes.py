@@ -27,6 +27,7 @@ def labels():
     )
 
 
+@pytest.mark.slow(first=True)
 def test_periodic_motions_are_those_of_find_cycle(labels):
     kinds = jb.decoded(labels).kind.values
     for i, frequency in enumerate(labels.frequency.values):

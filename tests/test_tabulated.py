@@ -47,6 +47,7 @@ def test_the_curve_goes_through_every_point_and_keeps_close_to_lines_between():
     assert np.ptp(far) < 0.01 and 0.3 < far[1] < 0.45
 
 
+@pytest.mark.slow(first=True)
 def test_a_cycle_with_a_table_is_the_oracles():
     osc = jb.Oscillator(0.03, (jb.Belt(0.3, jb.Tabulated(SPEEDS, MEASURED)),))
     cycle = jb.find_cycle(osc, (3.0, 0.0))

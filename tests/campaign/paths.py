@@ -12,6 +12,7 @@ more, and the cycles: the modes of one loop, and where they are. Three things mu
   the engine's runs take from it.
 """
 
+import functools
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -94,17 +95,26 @@ class Case:
         first, last = (end * self.measured for end in self.span)
         return first, last
 
-    def where(self, osc):
-        """The parameter of the package's oscillator."""
-        belt, name = self.parameter
-        if belt < 0:
+    @property
+    def where(self):
+        """The function that selects the parameter of the package's oscillator."""
+        return _selector(self.parameter)
+
+
+@functools.cache
+def _selector(parameter: tuple[int, str]):
+    """One function a parameter, so that what is compiled for it serves all paths."""
+    number, name = parameter
+
+    def where(osc):
+        if number < 0:
             return getattr(osc, name)
-        one = osc.belts[belt]
-        return (
-            getattr(one, name)
-            if name in ("velocity", "load", "lower", "upper")
-            else getattr(one.friction, name.removeprefix("law "))
-        )
+        belt = osc.belts[number]
+        if name in ("velocity", "load", "lower", "upper"):
+            return getattr(belt, name)
+        return getattr(belt.friction, name.removeprefix("law "))
+
+    return where
 
 
 def _with(osc: engine.Oscillator, parameter: tuple[int, str], value: float) -> engine.Oscillator:
