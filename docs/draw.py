@@ -155,8 +155,18 @@ def period_map():
     return figure
 
 
+def circle_map():
+    """Sticking motions as orbits of a circle map, of a cubic law and of Conti's."""
+    conti = jb.Belt(0.3, jb.Conti(static=1.0, residual=0.6, steepness=10.0))
+    pushed = jb.Oscillator(0.1, (conti,), forcing=jb.Harmonic(amplitude=0.5, frequency=1.3))
+    figure = journal_figure(6.6, 3.8)
+    for ax, osc in zip(figure.subplots(1, 2), (jb.presets.di_bernardo(1.68), pushed)):
+        jb.circle_map(osc).plot(ax)
+    return figure
+
+
 GALLERY = [model, region_map, history, phase_plane, diagram, orbit_diagram, basins]
-GALLERY += [basin_fractions, portrait, curve, period_map, vector_field, friction_laws]
+GALLERY += [basin_fractions, portrait, curve, period_map, vector_field, friction_laws, circle_map]
 
 # --- bifurcations ---------------------------------------------------------------------------------
 

@@ -27,7 +27,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     cycles/         outlines nearest sides shocks
     sweeps/         observers moments along reducers attractor strobes queue threads audit
     sweeps/         grid datasets question locks store progress work clusters sweep shares
-    sweeps/         naming forced_basins basins fractions orbit_diagram
+    sweeps/         naming forced_basins basins fractions orbit_diagram circle_map
     bifurcations/   special labels beside systems guesses base conditions forced tangencies
     bifurcations/   crossings rests edge_rests edges folds meetings connections infinity path scan
     bifurcations/   refine tracks curves cells faces bounds regions branches diagrams switch_folds

@@ -59,6 +59,7 @@ from .motion.simulate import Arcs, Events, Trajectory, simulate
 from .results import EventKind, Status, describe
 from .si import in_si
 from .sweeps.basins import Basins, BasinStability, basin_stability, basins
+from .sweeps.circle_map import CircleMap, circle_map
 from .sweeps.datasets import decoded
 from .sweeps.fractions import BasinFractions, basin_fractions
 from .sweeps.moments import AtEvents, AtExtrema, AtPhase, AtSection, AtTimes
@@ -94,6 +95,7 @@ __all__ = [
     "BifurcationDiagram",
     "BifurcationPoint",
     "BoundaryEquilibrium",
+    "CircleMap",
     "Conti",
     "CornerCollision",
     "Coulomb",
@@ -149,6 +151,7 @@ __all__ = [
     "basins",
     "bifurcation_curve",
     "bifurcation_diagram",
+    "circle_map",
     "decoded",
     "describe",
     "design",

@@ -198,6 +198,7 @@ MISTAKES = [
     ("jb.find_cycle(osc, (1.0,))", r"y0 must be of shape \(2\), got shape \(1,\)"),
     ("jb.find_cycle(osc, (3.0, 0.0), max_arcs=-3)", f"max_arcs {WHOLE}-3"),
     ("jb.periodic(osc, (0.0, 0.0))", "osc must be with a clock: periodic is for oscillators that"),
+    ("jb.circle_map(osc)", "osc must be with a clock: circle_map is for oscillators that"),
     ("jb.lyapunov(osc, (0.0, 0.0))", "osc must be with a clock: lyapunov is for oscillators that"),
     ("jb.SwitchingSliding()", r"SwitchingSliding\(\) takes belt \(the number of a belt"),
     ("jb.AddingSliding()", r"AddingSliding\(\) takes belt \(the number of a belt, such as 0\)"),

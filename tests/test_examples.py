@@ -31,11 +31,12 @@ PAGES = {
 #: What these compile, few other tests need.
 SLOW = """
 AddingSliding AtEvents AtExtrema AtPhase AtSection AtTimes BasinFractions BasinStability
-BeltAtRest BifurcationCurve BifurcationDiagram BoundaryEquilibrium CornerCollision CrossingSliding
-Design-class EdgeExchange Exponents FatalShock Fit-class Fold FoldOfCycles GrazingEdge MeetingEdges
+BeltAtRest BifurcationCurve BifurcationDiagram BoundaryEquilibrium CircleMap CornerCollision
+CrossingSliding Design-class EdgeExchange Exponents FatalShock Fit-class Fold FoldOfCycles
+GrazingEdge MeetingEdges
 OrbitDiagram PeriodDoubling PeriodicMotion Portrait-class PseudoHopf RegionMap SaddleConnection
 Separatrix SpecialPoint SwitchingSliding Torus attractors basin_fractions basin_stability basins
-bifurcation_curve bifurcation_diagram class design distance_to distance_to_basin_boundary
+bifurcation_curve bifurcation_diagram circle_map class design distance_to distance_to_basin_boundary
 find_cycle fit minimal_fatal_shock orbit_diagram plot_basins portrait region_map scan
 """.split()
 #: Long, and the only examples of what they show.

@@ -55,6 +55,7 @@ def test_every_public_function_and_class_that_takes_arguments_is_among_the_mista
     results |= {
         "BifurcationDiagram",
         "BifurcationPoint",
+        "CircleMap",
         "Cycle",
         "Design",
         "Equilibria",

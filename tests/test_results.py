@@ -113,6 +113,10 @@ def results() -> dict[type, Any]:
         ),
         jb.Explanation(4096, 4, 300_000, 1.5, 0.1),
         forced_motion(),
+        jb.CircleMap(
+            *(span[:4], span[:4], span[:4], np.array([True, True, True, False]), span[2:3]),
+            *((forced_motion(),), np.zeros(0), 2 * np.pi, 0, -1),
+        ),
         jb.Exponents(two, two, two, 100, zero, two, run.status),
         jb.Verified((0, 1, 3), (4,), (2,), False),
     ]
@@ -138,6 +142,7 @@ TABLES = {
     jb.BifurcationCurve: (6, "condition belts nu0 nu1 multiplier residual special"),
     jb.BifurcationDiagram: (1, "branch kind value stable x1_min x2_max period amplitude signature"),
     jb.BifurcationPoint: (1, "kind belts value error residual x1_min period multiplier status"),
+    jb.CircleMap: (5, "phase next_phase periods slope is_onset fixed_point"),
     jb.Cycle: (1, "stable x1_max period amplitude multiplier stick_duration_1 signature status"),
     jb.Design: (3, "what name value wanted"),
     jb.Equilibria: (1, "kind stable x1 x1_lower x1_upper rate frequency contact_0"),

@@ -196,7 +196,8 @@ class Program(eqx.Module):
 
     structure: of the oscillator's tree; mapped: which of its leaves differ from run to run; edges:
     whether a contact edge may be met; captures: whether a run ends where a pseudo-focus captures
-    it; derivatives: whether derivatives of the results are computed, too. made_of: distinguishes
+    it; derivatives: whether derivatives of the results are computed, too; own_t0: whether each run
+    begins at a time of its own, a column of the queue behind x1 and x2. made_of: distinguishes
     programs whose user code is the same, but reads different values.
     """
 
@@ -206,4 +207,10 @@ class Program(eqx.Module):
     edges: bool = eqx.field(static=True)
     captures: bool = eqx.field(static=True, default=True)
     derivatives: bool = eqx.field(static=True, default=False)
+    own_t0: bool = eqx.field(static=True, default=False)
     made_of: Any = eqx.field(static=True, default=None)
+
+    @property
+    def columns(self) -> int:
+        """How many columns the queue has: starts, and the leaves that differ from run to run."""
+        return 2 + self.own_t0 + sum(self.mapped)

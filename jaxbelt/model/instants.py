@@ -150,7 +150,7 @@ def _wave_numbers(velocity) -> tuple[Array, ...]:
     return (velocity, *[jnp.zeros(())] * 3)
 
 
-def _is_faster(osc: Oscillator, i: int, k: int, t: Array) -> Array:
+def is_faster(osc: Oscillator, i: int, k: int, t: Array) -> Array:
     """1 where belt i is faster than belt k just after they had the same velocity, else -1."""
     one, other = osc.belts[i].velocity, osc.belts[k].velocity
     size = 1e-13 * (1 + sum(abs(x) for v in (one, other) for x in _wave_numbers(v)[:2]))
@@ -199,7 +199,7 @@ def resolved(
     now = at_time(osc, t)
     x2 = y[1]
     mates = [[are_mates(osc, i, k) for k in range(n)] for i in range(n)]
-    faster = [[_is_faster(osc, i, k, t) for k in range(n)] for i in range(n)]
+    faster = [[is_faster(osc, i, k, t) for k in range(n)] for i in range(n)]
 
     def with_signs(codes: Sequence[Array]) -> Mode:
         rows = zip(zero, codes, mode.codes, strict=True)

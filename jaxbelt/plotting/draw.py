@@ -21,12 +21,13 @@ from ..inverse.fit import Fit
 from ..model.equilibria import Equilibria
 from ..motion.simulate import Arcs, Events, Trajectory
 from ..sweeps.basins import Basins, BasinStability
+from ..sweeps.circle_map import CircleMap
 from ..sweeps.fractions import BasinFractions
 from ..sweeps.orbit_diagram import OrbitDiagram
 from ..sweeps.store import Verified
 from ..sweeps.sweep import Explanation
 from .diagrams import plot_curves, plot_diagram, plot_special_point
-from .forced import plot_exponents, plot_motion
+from .forced import plot_circle_map, plot_exponents, plot_motion
 from .histories import plot_arcs, plot_events, plot_trajectory
 from .inverse import plot_fit
 from .orbits import plot_orbits
@@ -49,6 +50,7 @@ PICTURES: dict[type, Callable[..., Axes]] = {
     BifurcationCurve: _plot_curve,
     BifurcationDiagram: plot_diagram,
     BifurcationPoint: plot_point,
+    CircleMap: plot_circle_map,
     Cycle: plot_cycle,
     Design: plot_design,
     Equilibria: plot_equilibria,

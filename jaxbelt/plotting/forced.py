@@ -1,4 +1,6 @@
-"""Periodic motions of forced oscillators, and Lyapunov exponents."""
+"""Periodic motions of forced oscillators, Lyapunov exponents, and circle maps."""
+
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,11 +11,15 @@ from ..cycles.exponents import Exponents
 from ..cycles.periodic import PeriodicMotion
 from ..model.oscillator import at_time
 from ..results import Status
+from ..sweeps.circle_map import CircleMap
 from ..tables import require_single
 from .style import BELT_COLOURS, new_axes
 
 #: Points of a curve, for each period of the forcing.
 SAMPLES_OF_PERIOD = 257
+#: A circle map goes on from one phase to the next if it rises by no more than so many times what
+#: the larger of its slopes there says: twice, beside a square root.
+STEEPEST = 2.5
 
 
 def plot_motion(motion: PeriodicMotion, ax: Axes | None = None) -> Axes:
@@ -50,4 +56,46 @@ def plot_exponents(found: Exponents, ax: Axes | None = None) -> Axes:
     ax.set_xticks([0, 1], ["first", "second"])
     ax.set_xlabel("number")
     ax.set_ylabel("Lyapunov exponent")
+    return ax
+
+
+def plot_circle_map(found: CircleMap, ax: Axes | None = None) -> Axes:
+    """Draws a circle map and its fixed points; see `CircleMap.plot`."""
+    ax = new_axes() if ax is None else ax
+    turn, step = 2 * np.pi, found.phases[1]
+    ax.plot([0, turn], [0, turn], color="0.6", linewidth=0.8, label="diagonal")
+    x, slopes = (np.append(one, one[0]) for one in (found.phases, found.slopes))
+    y, lift = (np.append(one, one[0]) for one in (found.next_phases, found.elapsed))
+    x[-1] = turn
+    # How far the map rises to the next phase, once around the circle at most.
+    rise = step + turn * np.diff(lift) / found.period
+    slopes = np.abs(slopes)
+    breaks = np.abs(rise) > STEEPEST * step * np.maximum(slopes[1:], slopes[:-1])
+    around = ~np.isclose(np.diff(y), rise, rtol=0.0, atol=1e-6)
+    ends = breaks | around | ~np.isfinite(rise)
+    x, y = np.insert(x, at := np.flatnonzero(ends) + 1, np.nan), np.insert(y, at, np.nan)
+    ax.plot(x, y, color="black", linewidth=1.0, label="next onset")
+    alone = ends & np.roll(ends, 1)
+    style: dict[str, Any] = dict(color="black", markersize=2.0)
+    ax.plot(found.phases[alone], found.next_phases[alone], ".", **style)
+    for is_stable, fill, word in ((True, "black", "stable"), (False, "white", "unstable")):
+        places = found.fixed_points[found.stable == is_stable]
+        if len(places):
+            style = dict(markeredgecolor="black", markerfacecolor=fill, markersize=4.5, zorder=3)
+            ax.plot(places, places, "o", **style, label=f"{word} fixed point")
+    if not np.all(found.is_onset):
+        edges = np.append(found.phases, turn) - 0.5 * step
+        none = np.append(~found.is_onset, ~found.is_onset[0])
+        span: dict[str, Any] = dict(
+            transform=ax.get_xaxis_transform(), color="0.92", linewidth=0, zorder=0
+        )
+        ax.fill_between(edges, 0, 1, where=none, step="post", **span, label="no onset")
+    quarters = np.arange(5) * turn / 4
+    names = ["0", r"$\pi/2$", r"$\pi$", r"$3\pi/2$", r"$2\pi$"]
+    ax.set_xticks(quarters, names)
+    ax.set_yticks(quarters, names)
+    ax.set(xlim=(0, turn), ylim=(0, turn), aspect="equal")
+    ax.set_xlabel(r"phase of slip onset $\varphi_n$")
+    word = "next one" if found.iterate == 1 else f"{found.iterate}-th next one"
+    ax.set_ylabel(rf"phase of the {word} $\varphi_{{n+{found.iterate}}}$")
     return ax

@@ -11,7 +11,8 @@
 - `shares`: the attractors that several starts lead to, and how many lead to each;
 - `basins`: the same for starts of one oscillator; `fractions`: for starts at many values of one
   parameter, the attractors matched from value to value;
-- `orbit_diagram`: the points of attractors against one parameter.
+- `orbit_diagram`: the points of attractors against one parameter;
+- `circle_map`: from the phase of one slip onset to that of the next.
 
 A new observable is a subclass of `kernel.lanes.Observer` in a file of its own; `sweep` takes it as
 it is.

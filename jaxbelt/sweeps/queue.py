@@ -48,7 +48,7 @@ DEFAULT_TOLERANCE = 1e-8
 
 def _oscillators(program: Program, shared, rows: tuple[Array, ...]) -> OwnOscillator:
     """The oscillators of the lanes: leaves that differ from run to run are arrays [lanes]."""
-    leaves, column = [], 2
+    leaves, column = [], 2 + program.own_t0
     others = iter(shared)
     for is_mapped in program.mapped:
         if is_mapped:
@@ -152,7 +152,7 @@ class Common(eqx.Module):
 
     shared: the leaves of the oscillator that do not differ from run to run; t1; rtol; atol: in the
     units in which runs are given, NaN for the default; limit: how many passes a run may take. t0:
-    where all begin, of those that know the time; None: at 0.
+    where all begin, of those that know the time, unless each has its own; None: at 0.
     """
 
     shared: list[Array]
@@ -223,7 +223,7 @@ def _refill(program: Program, common: Common, block: _Block, desk: _Desk) -> _De
     pairs = zip(block.rows, desk.stream.rows, strict=True)
     rows = tuple(jnp.where(takes, column[place], row) for column, row in pairs)
     osc = _oscillators(program, common.shared, rows)
-    numbers = passes, common.rtol, common.t0
+    numbers = passes, common.rtol, rows[2] if program.own_t0 else common.t0
     fresh = _begin(program, osc, block.first + place, rows[0], rows[1], *numbers)
     lanes = choose(takes, fresh, replace(lanes, run=jnp.where(free, -1, lanes.run)))
     return _Desk(
@@ -413,7 +413,7 @@ def layout(program: Program, shared: list[Array]) -> dict[str, tuple[int, ...]]:
     """The results of a run in the order of their columns: the shape of each by name."""
 
     def finish():
-        stream = idle(program, shared, 1, 2 + sum(program.mapped))
+        stream = idle(program, shared, 1, program.columns)
         osc = _oscillators(program, shared, stream.rows)
         return _handed_in(program.observer, osc, stream.lanes)
 

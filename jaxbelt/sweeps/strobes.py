@@ -121,7 +121,7 @@ class _Extent(eqx.Module):
         return replace(self, low=low, high=high)
 
 
-class _Growth(eqx.Module):
+class Growth(eqx.Module):
     """The tangent and the logarithms of its growth, arrays [lanes].
 
     d1, d2: the tangent, of size one when it was last looked at; log: its growth by then; since,
@@ -142,7 +142,7 @@ class _Growth(eqx.Module):
     sticks: Array
 
     @classmethod
-    def none(cls, lanes: Lanes) -> "_Growth":
+    def none(cls, lanes: Lanes) -> "Growth":
         zero = jnp.zeros_like(lanes.t)
         return cls(
             d1=zero + np.cos(1.0),
@@ -184,7 +184,7 @@ class _RunSoFar(eqx.Module):
     turns: Array
     repeats: _Repeats
     extent: _Extent
-    growth: _Growth
+    growth: Growth
     kind: Array
     periods: Array
     loop_events: Array
@@ -201,16 +201,16 @@ class LargestExponent(Observer):
     }
 
     def start(self, osc, lanes):
-        return _Growth.none(lanes)
+        return Growth.none(lanes)
 
     def follow(self, take_step, osc, window, ones, lanes, t1, rtol, atol):
         new = take_step(osc, window, ones, lanes, t1, rtol, atol)
-        course = _course_of_step(osc, lanes, new, ones)
-        growth = _grown(osc, lanes.memory, lanes, course, course.duration, ones)
+        course = course_of_step(osc, lanes, new, ones)
+        growth = grown(osc, lanes.memory, lanes, course, course.duration, ones)
         return replace(new, memory=growth)
 
     def watch(self, osc, lanes, passage, ones, t1, tol):
-        return replace(lanes, memory=_grown_past(osc, lanes.memory, lanes, passage, t1))
+        return replace(lanes, memory=grown_past(osc, lanes.memory, lanes, passage, t1))
 
     def finish(self, osc, lanes):
         exponent, error = lanes.memory.exponent()
@@ -262,7 +262,7 @@ class ForcedAttractor(Observer):
             turns=turns,
             repeats=repeats,
             extent=_Extent.none(lanes, len(osc.belts)),
-            growth=_Growth.none(lanes),
+            growth=Growth.none(lanes),
             kind=count,
             periods=count,
             loop_events=count,
@@ -276,12 +276,12 @@ class ForcedAttractor(Observer):
         strobe = seen.strobes.astype(lanes.t.dtype) * _strobe_period(osc, seen.turns)
         until = jnp.where(strobe > lanes.t, jnp.minimum(t1, strobe), t1)
         new = take_step(osc, window, ones, lanes, until, rtol, atol)
-        course = _course_of_step(osc, lanes, new, ones)
+        course = course_of_step(osc, lanes, new, ones)
         theta = self._cut(seen, course, ones)
         cut = theta < 1
         new = choose(cut, replace(lanes, h=theta * course.duration), new)
         h = jnp.where(cut, 0.0, course.duration)
-        growth = _grown(osc, seen.growth, lanes, course, h, ones)
+        growth = grown(osc, seen.growth, lanes, course, h, ones)
         # What is known stays until the lane hands it in.
         going_on = seen.kind == UNDECIDED
         extent = self._extended(seen.extent, lanes, new, course)
@@ -388,7 +388,7 @@ class ForcedAttractor(Observer):
 
     def watch(self, osc, lanes, passage, ones, t1, tol):
         seen: _RunSoFar = lanes.memory
-        growth = _grown_past(osc, seen.growth, lanes, passage, t1)
+        growth = grown_past(osc, seen.growth, lanes, passage, t1)
         resting = jnp.where(passage.captured, EQUILIBRIUM, seen.kind)
         forever = lanes.status == Status.STUCK_FOREVER.value
         kind = jnp.where(forever & (seen.kind == UNDECIDED), STUCK_FOR_EVER, resting)
@@ -447,7 +447,7 @@ class ForcedAttractor(Observer):
         }
 
 
-def _course_of_step(osc: OwnOscillator, lanes: Lanes, new: Lanes, ones: Array) -> Course:
+def course_of_step(osc: OwnOscillator, lanes: Lanes, new: Lanes, ones: Array) -> Course:
     """The way of lanes in a step."""
     ends = [(one.x1, one.x2, _x2_slope(osc, lanes.mode, one)) for one in (lanes, new)]
     return Course.of_step(ends[0], ends[1], materialise(new.t - lanes.t, ones))
@@ -487,7 +487,7 @@ def _way_to_zero(value: Array, slope: Array, h: Array) -> Array:
 # --- tangents -------------------------------------------------------------------------------------
 
 
-def _grown(osc, growth: _Growth, lanes: Lanes, course: Course, h: Array, ones) -> _Growth:
+def grown(osc, growth: Growth, lanes: Lanes, course: Course, h: Array, ones) -> Growth:
     """The tangent after a step of size h; along a slip arc the trace of the field is taken into the
     logarithm."""
     mode, d1, d2, log = lanes.mode, growth.d1, growth.d2, growth.log
@@ -517,7 +517,7 @@ def _grown(osc, growth: _Growth, lanes: Lanes, course: Course, h: Array, ones) -
     return replace(growth, d1=materialise(d1, ones), d2=materialise(d2, ones), log=log)
 
 
-def _grown_past(osc, growth: _Growth, lanes: Lanes, passage: Passage, t1: Array) -> _Growth:
+def grown_past(osc, growth: Growth, lanes: Lanes, passage: Passage, t1: Array) -> Growth:
     """The tangent behind the events that were passed, and its growth until now."""
     before = growth.d1, growth.d2
 
@@ -533,7 +533,7 @@ def _grown_past(osc, growth: _Growth, lanes: Lanes, passage: Passage, t1: Array)
     return _counted(growth, lanes.t, t1)
 
 
-def _counted(growth: _Growth, t: Array, t1: Array) -> _Growth:
+def _counted(growth: Growth, t: Array, t1: Array) -> Growth:
     """The tangent of size one, its growth in the logarithm, and the block ended that is over."""
     size = jnp.hypot(growth.d1, growth.d2)
     size = jnp.where((size > 0) & jnp.isfinite(size), size, 1.0)
@@ -563,15 +563,20 @@ def _counted(growth: _Growth, t: Array, t1: Array) -> _Growth:
 def _saltation(osc: OwnOscillator, before: Mode, after: Mode, number: Array, y, d):
     """The tangent behind an event, of scalars: the guard of that number fired at the state y."""
     entry, exit_ = field_at(osc, before, y), field_at(osc, after, y)
+    late = delay_of_event(osc, before, number, y, d)
+    d1 = d[0] + (entry[0] - exit_[0]) * late
+    d2 = d[1] + (entry[1] - exit_[1]) * late
+    return d1, jnp.where(after.any_stuck, 0.0, d2)
+
+
+def delay_of_event(osc: OwnOscillator, before: Mode, number: Array, y, d) -> Array:
+    """How much later, for a tangent d, the guard of that number fires; 0 where it is touched."""
 
     def guard(*y):
         guards = guards_at(osc, before, y)
         return jnp.sum(jnp.where(jnp.arange(guards.size) == number.astype(int), guards, 0.0))
 
     _, moved = jax.jvp(guard, y, (*d, jnp.zeros_like(d[0])))
-    _, slope = jax.jvp(guard, y, entry)
+    _, slope = jax.jvp(guard, y, field_at(osc, before, y))
     late = -moved / jnp.where(slope == 0, 1.0, slope)
-    late = jnp.where(slope == 0, 0.0, late)
-    d1 = d[0] + (entry[0] - exit_[0]) * late
-    d2 = d[1] + (entry[1] - exit_[1]) * late
-    return d1, jnp.where(after.any_stuck, 0.0, d2)
+    return jnp.where(slope == 0, 0.0, late)

@@ -116,7 +116,7 @@ def run(
     limit = int(budget * STEP_BUDGET * max(1.0, span / 100)) // (STEPS_PER_ROUND * ROUNDS_PER_PASS)
     limit = min(limit, largest)
     threads = workers() if threads is None else threads
-    columns = 2 + sum(program.mapped)
+    columns = program.columns
     atol = np.nan if atol is None else atol
     width = lanes_for(-(-runs // threads))
     most = CHUNK.here * width // WIDTH.here
