@@ -5,6 +5,8 @@ differences; closed forms of Den Hartog; the numbers of di Bernardo, Kowalczyk a
 independent engines computed.
 """
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
@@ -159,6 +161,41 @@ def test_at_follows_a_motion_to_other_oscillators(sticking):
     assert moved[1] == pytest.approx(np.asarray(sticking.start), abs=1e-11)
     other = jb.find_cycle(bkn(1.682), (0.5, 0.0))
     assert moved[2] == pytest.approx(np.asarray(other.start), abs=1e-10)
+
+
+def beyond_adding(amplitude):
+    """One belt; from amplitude 0.8544 on it sticks twice, first for no time."""
+    law, force = jb.Conti(0.8, 0.5, 2.0), jb.Harmonic(amplitude, 1.0, np.pi / 2)
+    return jb.Oscillator(0.2, (jb.Belt(0.15, law),), forcing=force)
+
+
+@pytest.mark.slow(first=True)
+def test_motions_are_exact_however_far_they_are_followed():
+    """The steps of integration of the first ones would be too long for the others."""
+    first = jb.find_cycle(beyond_adding(0.8625), (0.0, 0.15))
+    assert len(first.signature) == 4
+    there = jb.find_cycle(beyond_adding(0.88), (0.0, 0.15))
+    one = jnp.zeros_like(first.chain.mesh).at[:, 0].set(1.0)
+    coarse = replace(first, chain=replace(first.chain, mesh=one))
+    for motion, status in ((first, OK), (coarse, jb.Status.NO_CONVERGENCE)):
+        moved = motion.at(beyond_adding(0.88))
+        assert moved.start == pytest.approx(np.asarray(there.start), abs=1e-11)
+        traced = jax.jit(lambda amplitude, motion: motion.at(beyond_adding(amplitude)))
+        assert int(traced(0.88, motion).status) == status
+
+    def amplitude_of(osc):
+        return osc.forcing[0].amplitude
+
+    # Through the point at 0.8544, beyond which it sticks twice.
+    start = jb.find_cycle(beyond_adding(0.85), (0.0, 0.15))
+    found = jb.bifurcation_diagram(start.oscillator, amplitude_of, (0.84, 0.94), start=start)
+    (branch,), law = found.branches, ("conti", 0.8, 0.5, 2.0)
+    assert [point.kind for point in found.points] == ["AddingSliding"]
+    for value, motion in zip(branch.values, branch.cycles, strict=True):
+        wave = forced.Harmonic(float(value), 1.0, np.pi / 2)
+        osc = forced.Oscillator(0.2, (forced.Belt(0.15, law),), (wave,))
+        end = forced_cases.stroboscopic(osc, np.asarray(motion.start), 1).y_end
+        assert end == pytest.approx(np.asarray(motion.start), abs=2e-10), value
 
 
 def test_no_number_depends_on_the_unit_of_length(sticking):

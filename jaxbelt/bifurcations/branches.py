@@ -19,12 +19,11 @@ from jaxtyping import Array
 
 from ..activity import note_progress
 from ..cycles.clocked import TimedChain, timed_blocks, turns_of
-from ..cycles.periodic import PeriodicMotion, is_same_motion, motion_at, periodic_from
+from ..cycles.periodic import PeriodicMotion, is_same_motion, motion_near, periodic_from
 from ..cycles.shooting import jacobian
 from ..model.oscillator import Oscillator
 from ..model.own_units import in_own_units
 from ..model.variations import Family, Variation
-from ..numerics.compiling import jit
 from ..numerics.continuation import Corrected, corrected
 from ..results import Status
 from .base import AbstractCondition, BifurcationPoint
@@ -141,9 +140,15 @@ class MotionLeg(NamedTuple):
         return solved._replace(found=bool(solved.found) and bool(settled))
 
     def row(self, u: np.ndarray) -> MotionRow:
-        z = (u[:-1] / np.asarray(self.weights)).reshape(-1, 4)
+        z = jnp.asarray(u[:-1] / np.asarray(self.weights)).reshape(-1, 4)
         value = float(self.line.length * u[-1])
-        return MotionRow(value, _motion_of_row(self.line.at(value), self.chain, jnp.asarray(z)))
+        return MotionRow(value, motion_near(self.line.at(value), self.chain, z))
+
+    def going_on(self, row: MotionRow) -> tuple["MotionLeg", np.ndarray]:
+        """The leg with the steps of integration of a row of it, and the unknowns of that."""
+        z = np.asarray(row.motion.unknowns).reshape(-1)
+        u = np.append(np.asarray(self.weights) * z, row.value / self.line.length)
+        return self._replace(chain=row.motion.chain), u
 
     def start(self, u: np.ndarray) -> np.ndarray:
         """The state at the phase 0, also of what is no motion."""
@@ -158,12 +163,6 @@ def _linearized_motion(
     value, blocks = timed_blocks(family.at(p), jax.jacfwd(family.at)(p), chain, z)
     own = jacobian(blocks[..., :4]) / weights[None]
     return value.reshape(-1), jnp.append(own, unit * blocks[..., 4:].reshape(-1, 1), axis=1)
-
-
-@jit
-def _motion_of_row(osc: Oscillator, chain: TimedChain, z: Array) -> PeriodicMotion:
-    none = jnp.zeros((), int)
-    return motion_at(osc, chain, z, jnp.zeros(()), none, none)
 
 
 def _side_of_point(
@@ -220,7 +219,8 @@ def _branch_leg(
         points += list(_points_between(line, last, new))
         rows.append(new)
         step = min(LONGEST_STEP_OF_BRANCH, 1.5 * step)
-        u, tangent, last = solved.u, solved.tangent, new
+        tangent, last = solved.tangent, new
+        leg, u = leg.going_on(new)
     return rows, points, None
 
 

@@ -188,7 +188,8 @@ class PeriodicMotion(eqx.Module):
     def at(self, osc: Oscillator) -> "PeriodicMotion":
         """The motion with the same signature of another oscillator, near to its own.
 
-        Works under `jax.jit`, `jax.vmap` and derivatives.
+        Works under `jax.jit`, `jax.vmap` and derivatives. There it keeps the steps of integration
+        of this motion; where they are too long for the other one its status is NO_CONVERGENCE.
 
         Args:
             osc: An oscillator with the same belts and forces, but for their numbers.
@@ -201,7 +202,11 @@ class PeriodicMotion(eqx.Module):
         z = self.unknowns
         if own is not osc:
             z = jnp.concatenate([own.units.into(z[..., :2]), z[..., 2:]], axis=-1)
-        found, _ = _polished_motion(own, self.chain, lax.stop_gradient(z))
+        z = lax.stop_gradient(z)
+        if is_concrete((own, self)) and z.ndim == 2:
+            return in_given_units(motion_near(own, self.chain, z), osc, own)
+        found, error = _polished_motion(own, self.chain, z)
+        found = _known_where(found, error < HOLDS)
         return in_given_units(found, osc, own)
 
     def row(self) -> dict[str, Any]:
@@ -454,6 +459,30 @@ def solved_from(osc: Oscillator, loop: Loop, turns: int) -> PeriodicMotion:
     return motion
 
 
+def motion_near(osc: Oscillator, chain: TimedChain, z: Array) -> PeriodicMotion:
+    """The motion near the unknowns of a chain, which may be another oscillator's: with steps of its
+    own where those of the chain leave an error."""
+    motion, error = _polished_motion(osc, chain, z)
+    converged = int(motion.status) in (Status.OK, Status.NOT_ADMISSIBLE)
+    if not converged or float(error) < EXACT_MOTION:
+        return motion
+    return solved_from(osc, Loop(chain.codes, chain.ends, z[:, :3], z[:, 3]), chain.turns)
+
+
+def _known_where(motion: PeriodicMotion, fine: Array) -> PeriodicMotion:
+    """The motion, NaN with NO_CONVERGENCE where it is not fine."""
+    status = jnp.where(fine, motion.status, Status.NO_CONVERGENCE.value)
+    status = jnp.where(motion.status == Status.OK, status, motion.status)
+    known = jnp.where(status == Status.OK, 1.0, jnp.nan)
+    return replace(
+        motion,
+        unknowns=motion.unknowns * known,
+        multipliers=motion.multipliers * known.astype(complex),
+        residual=motion.residual * known,
+        status=status,
+    )
+
+
 def nothing_found(osc: Oscillator, turns: int, status: int) -> PeriodicMotion:
     """What is returned where there is no motion: NaN, and why."""
     n, arcs = len(osc.belts), SIZES[0]
@@ -489,7 +518,7 @@ def periodic_from(osc: Oscillator, guess: Any, periods: int, turns: int) -> Peri
             continue
         change = _period_step(osc, followed, turns)
         size = float(np.max(np.abs(change)))
-        if not np.isfinite(size):
+        if not 0 < size < np.inf:
             break
         y = y + change * min(1.0, 0.5 / size)
     return motion if motion is not None else nothing_found(osc, turns, Status.NO_CONVERGENCE)

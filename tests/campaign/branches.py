@@ -13,6 +13,7 @@ motion; differences of its runs say whether the row is stable. Then
 import functools
 from collections import Counter
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -91,7 +92,7 @@ def outcome(options, number: int) -> Outcome:
             one.counts[f"row: {said}"] += 1
             if said.startswith("wrong"):
                 one.wrong.append(f"{said} at {row['value']!r}: {row}\n    {where}")
-        for i, (before, after) in enumerate(zip(rows, rows[1:])):
+        for i, (before, after) in enumerate(pairwise(rows)):
             pairs.append((before, after, _turns(branch.values, i), i in (0, len(rows) - 2)))
     _compare(one, pairs, found.points, where)
     return one
@@ -159,17 +160,14 @@ def _compare(one, pairs, points, where):
             one.counts["points that failed"] += 1
             continue
         value, start = float(point.value), np.asarray(point.cycle.start)
-        nearest = sorted(
-            (_distance(value, start, pair), i) for i, pair in enumerate(pairs)
-        )[:2]
-        for distance, i in nearest:
-            with_point[i] += 1
+        nearest = sorted((_distance(value, start, pair), i) for i, pair in enumerate(pairs))[:2]
+        with_point.update(i for _, i in nearest)
         changes = any(_changes(pairs[i]) or pairs[i][3] for _, i in nearest)
         one.counts[f"{point.kind}: {'changes' if changes else 'nothing changes'}"] += 1
         if not changes:
             one.notes.append(f"nothing changes at {point!r}\n    {where}")
     for i, pair in enumerate(pairs):
-        before, after, turns, _ = pair
+        before, after = pair[:2]
         changes = before["events"] != after["events"] or before["stable"] != after["stable"]
         if changes and not with_point[i] and min(before["margin"], after["margin"]) > 1e-7:
             one.counts["changes without a point"] += 1
