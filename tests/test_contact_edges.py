@@ -158,6 +158,7 @@ def test_points_of_sequential_belts():
     assert oracle_cycles.sticking_cycle(make(corner + 1e-7), T=400.0) is None
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("idle", [0.0, 0.7])
 def test_a_belt_at_rest_without_load_brakes_nothing_at_a_pseudo_focus(idle):
     """Left of the edge x2' is 0.2 + (0.25 - damping) x2, to first order, right of it -0.5 - damping

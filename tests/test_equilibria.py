@@ -221,6 +221,7 @@ def oracle_three_belts(zeta, omega, *p):
     return oracle.Oscillator(zeta, tuple(belts), omega)
 
 
+@pytest.mark.slow(first=True)
 def test_three_belts_of_three_laws_in_seven_zones():
     rng = np.random.default_rng(7)
     low = [0.0, 0.5] + 3 * [-0.8] + 3 * [0.3] + 3 * [0.1] + 3 * [-1.0]

@@ -256,6 +256,7 @@ def test_extremes_and_their_derivatives_are_those_of_the_closed_form():
     assert jax.grad(amplitude_at)(0.6) == pytest.approx(wanted, abs=1e-9)
 
 
+@pytest.mark.slow(first=True)
 def test_functionals_of_a_motion_that_sticks():
     motion = jb.find_cycle(bkn(1.68), (0.5, 0.0))
     run = forced_cases.stroboscopic(bkn_of_engine(1.68), np.asarray(motion.start), 2)
@@ -276,6 +277,7 @@ def test_functionals_of_a_motion_that_sticks():
 # --- design ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(first=True)
 def test_design_meets_an_amplitude_at_a_frequency():
     plan = jb.design(
         den_hartog(0.7), [(jb.amplitude, 1.5)], where=lambda osc: osc.forcing[0].amplitude

@@ -134,6 +134,7 @@ def test_a_basin_stability_has_no_units():
     assert ours.fraction.values.tolist() == [0.25, 0.75] and ours.kind.values[0] == "cycle"
 
 
+@pytest.mark.slow(first=True)
 def test_a_cycle_in_si():
     m = machine()
     cycle = jb.find_cycle(m.oscillator, m.start(0.003, 0.0))

@@ -329,6 +329,7 @@ class Gauss(jb.AbstractFriction):
         return 0.6 + 0.4 * jnp.exp(-((speed / self.speed) ** 2))
 
 
+@pytest.mark.slow(first=True)
 def test_laws_of_the_user_are_scaled_from_outside():
     length, omega = 2.0**-20, 8.0
 

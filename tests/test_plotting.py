@@ -424,6 +424,7 @@ def test_a_law_of_a_physical_belt_is_in_its_unit():
     assert jb.plot_friction_law(belt, speed=0.1).get_xlabel() == "relative velocity $R$ (m/s)"
 
 
+@pytest.mark.slow(first=True)
 def test_a_sweep_of_attractors_says_that_one_start_was_asked():
     """Class (a) rests or sticks, by its start, between its Hopf point and its fold."""
     nus = np.array([0.15, 0.22, 0.3])

@@ -152,6 +152,7 @@ def test_error_falls_with_the_tolerance():
     assert errors[-1] < 1e-9
 
 
+@pytest.mark.slow(first=True)
 def test_rest_up_to_rounding_on_the_boundary_of_an_idle_belt_at_rest():
     """The motion shrinks to a focus at (0.6111, 0), and each half loop ends on that boundary."""
     law = jb.Conti(1.0, 0.5, 10.0)
