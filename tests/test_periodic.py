@@ -378,6 +378,32 @@ def test_den_hartog_without_stops():
 
 
 @pytest.mark.slow(first=True)
+def test_a_symmetric_motion_loses_two_stops_at_once():
+    """Den Hartog's, at low frequencies, where a stop of each half ends in a grazing."""
+    few, many = (jb.find_cycle(den_hartog(value), (1.0, 0.0)) for value in (0.145, 0.1456))
+    assert (len(few.signature), len(many.signature)) == (4, 8)
+    found = [
+        jb.refine(jb.GrazingSliding(0), one.oscillator, where=frequency_of, start=one)
+        for one in (few, many)
+    ]
+    assert [int(point.status) for point in found] == [OK, OK]
+    assert found[0].value == pytest.approx(float(found[1].value), abs=1e-10)
+    diagram = jb.bifurcation_diagram(den_hartog(0.1456), frequency_of, (0.144, 0.147), start=many)
+    assert [point.kind for point in diagram.points] == ["GrazingSliding"]
+    assert diagram.open_ends == ()
+    # The engine on both sides.
+    law = ("coulomb", 1.0, 1.0)
+    for off, stops in ((-2e-6, 2), (2e-6, 4)):
+        frequency = float(found[0].value) + off
+        belts = (forced.Belt(0.0, law, FRICTION),)
+        osc = forced.Oscillator(0.05, belts, (forced.Harmonic(1.0, frequency),))
+        start = np.asarray(jb.find_cycle(den_hartog(frequency), (1.0, 0.0)).start)
+        run = forced_cases.stroboscopic(osc, start, 1)
+        assert run.y_end == pytest.approx(start, abs=1e-9)
+        assert int(np.sum(run.kind == forced.STICK)) == stops
+
+
+@pytest.mark.slow(first=True)
 def test_the_amplitude_and_its_derivatives_are_those_of_the_closed_form():
     def height(frequency, friction):
         return jb.amplitude(jb.find_cycle(den_hartog(frequency, friction), (0.0, 0.0)))

@@ -41,6 +41,10 @@ from .tangencies import GrazingSliding
 
 #: First, shortest and longest step, of which the parameter's part is measured in parts of the span.
 FIRST_STEP_OF_BRANCH, SHORTEST_STEP_OF_BRANCH, LONGEST_STEP_OF_BRANCH = 2e-3, 1e-7, 2e-2
+#: The conditions on sliding are solved again only where steps have become so much shorter.
+SEARCH_AGAIN = 2e-3
+#: Rows after one that was none before steps become longer again.
+STRAIGHT_ROWS = 3
 #: Cosine of the largest angle between tangents of neighbours.
 STRAIGHT_BRANCH = 0.95
 #: Steps on each side at most.
@@ -58,6 +62,13 @@ class MotionRow(NamedTuple):
 
     value: float
     motion: PeriodicMotion
+
+
+class MotionBranch(NamedTuple):
+    """Motions along a branch, and values inside of the span at which it ends without a point."""
+
+    rows: list[MotionRow]
+    open_ends: list[float]
 
 
 class ForcedLine(NamedTuple):
@@ -78,24 +89,25 @@ class ForcedLine(NamedTuple):
 
 def forced_branches(
     variation: Variation, span: tuple[float, float], start: PeriodicMotion, value: float
-) -> tuple[list[list[MotionRow]], list[BifurcationPoint]]:
+) -> tuple[list[MotionBranch], list[BifurcationPoint]]:
     """The branch of a motion at a value, within a span, to both sides, and those that leave it at
     period doublings; and the points on them. All in own units."""
     line = ForcedLine(variation, *span, turns_of(start.oscillator))
-    branches, points, waiting = [], [], [(MotionRow(value, start), True)]
+    branches, found, waiting = [], [], [(MotionRow(value, start), True)]
     while waiting:
         row, is_first = waiting.pop(0)
         sides = [_side_of_point(line, row, sign) for sign in (-1.0, 1.0)]
-        (behind, before), (ahead, after) = sides
-        branches.append([*reversed(behind[1:]), *ahead])
-        for point in (*before, *after):
-            if any(_is_known_motion(point, one, line) for one in points):
+        behind, ahead = (side for side, _ in sides)
+        ends = [*behind.open_ends, *ahead.open_ends]
+        branches.append(MotionBranch([*reversed(behind.rows[1:]), *ahead.rows], ends))
+        for point in (point for _, points in sides for point in points):
+            if any(_is_known_motion(point, one, line) for one in found):
                 continue
-            points.append(point)
+            found.append(point)
             if is_first and isinstance(point.condition, PeriodDoubling):
                 leaving = _leaving(line, point)
                 waiting += [(leaving, False)] if leaving is not None else []
-    return branches, sorted(points, key=lambda point: float(point.value))
+    return branches, sorted(found, key=lambda point: float(point.value))
 
 
 def _is_known_motion(point: BifurcationPoint, other: BifurcationPoint, line: ForcedLine) -> bool:
@@ -144,11 +156,14 @@ class MotionLeg(NamedTuple):
         value = float(self.line.length * u[-1])
         return MotionRow(value, motion_near(self.line.at(value), self.chain, z))
 
-    def going_on(self, row: MotionRow) -> tuple["MotionLeg", np.ndarray]:
-        """The leg with the steps of integration of a row of it, and the unknowns of that."""
-        z = np.asarray(row.motion.unknowns).reshape(-1)
-        u = np.append(np.asarray(self.weights) * z, row.value / self.line.length)
-        return self._replace(chain=row.motion.chain), u
+    def going_on(
+        self, row: MotionRow, tangent: np.ndarray
+    ) -> tuple["MotionLeg", np.ndarray, np.ndarray]:
+        """The leg in the sizes of a row of it, and with the row's steps of integration; the row's
+        unknowns, and the tangent, in these sizes."""
+        leg, u = MotionLeg.of(self.line, row)
+        tangent = tangent * np.append(np.asarray(leg.weights / self.weights), 1.0)
+        return leg, u, tangent / np.linalg.norm(tangent)
 
     def start(self, u: np.ndarray) -> np.ndarray:
         """The state at the phase 0, also of what is no motion."""
@@ -167,8 +182,8 @@ def _linearized_motion(
 
 def _side_of_point(
     line: ForcedLine, row: MotionRow, sign: float
-) -> tuple[list[MotionRow], list[BifurcationPoint]]:
-    """The branch to one side of a motion: leg by leg."""
+) -> tuple[MotionBranch, list[BifurcationPoint]]:
+    """The branch to one side of a motion, leg by leg, and the points on it."""
     rows, points = [row], []
     while len(rows) < MOST_MOTIONS:
         note_progress(f"{len(rows)} motions on one side")
@@ -176,26 +191,32 @@ def _side_of_point(
         rows += ahead
         points += found
         if further is None:
-            break
+            return MotionBranch(rows, []), points
+        if isinstance(further, float):
+            return MotionBranch(rows, [further]), points
         new, sign = further
         rows.append(new)
-    return rows, points
+    return MotionBranch(rows, [rows[-1].value]), points
 
 
 def _branch_leg(
     line: ForcedLine, row: MotionRow, sign: float
-) -> tuple[list[MotionRow], list[BifurcationPoint], tuple[MotionRow, float] | None]:
-    """The motions after a row with its signature, the points on the way, and, where the signature
-    ends, the first motion with another one, and the sense in which the parameter goes from it."""
+) -> tuple[list[MotionRow], list[BifurcationPoint], tuple[MotionRow, float] | float | None]:
+    """The motions after a row with its signature, the points on the way, and how it goes on.
+
+    Where the signature ends that is the first motion with another one, and the sense in which the
+    parameter goes from it. It is None where the branch leaves the span, or ends in a point, and a
+    value where it ends otherwise.
+    """
     leg, u = MotionLeg.of(line, row)
     axis = np.zeros_like(u)
     axis[-1] = 1.0
     begun = leg.corrected(u, axis, 0.0)
     if not begun.found:
-        return [], [], None
+        return [], [], row.value
     u, tangent = begun.u, sign * begun.tangent * np.sign(begun.tangent[-1])
-    rows, points, step = [], [], FIRST_STEP_OF_BRANCH
-    last = row
+    rows, points, step, straight = [], [], FIRST_STEP_OF_BRANCH, STRAIGHT_ROWS
+    last, borders, searched = row, [], np.inf
     while len(rows) < MOST_MOTIONS and step > SHORTEST_STEP_OF_BRANCH:
         solved = leg.corrected(u, tangent, step)
         if not solved.found or solved.tangent @ tangent < STRAIGHT_BRANCH:
@@ -207,21 +228,32 @@ def _branch_leg(
             rows += _at_end(leg, u, solved.u, end, line)
             return rows, points, None
         if int(new.motion.status) != Status.OK:
-            start, direction = leg.start(solved.u), float(np.sign(tangent[-1]))
-            turned = _past_phase(line, last, new.value, start)
-            if turned is not None:
-                return rows, points, (turned, float(np.sign(new.value - last.value)))
-            point = _border(line, last, new.value, start)
+            start = leg.start(solved.u)
+            if step < SEARCH_AGAIN * searched:
+                turned = _past_phase(line, last, new.value, start)
+                if turned is not None:
+                    return rows, points, (turned, float(np.sign(new.value - last.value)))
+                borders, searched = _borders(line, last), step
+            point = _border(line, borders, last, new.value, start)
             if point is not None:
-                return rows, [*points, point], _beyond_point(line, last, point, direction)
-            step *= 0.5
+                return rows, [*points, point], _beyond_point(line, last, point, tangent[-1])
+            step, straight = 0.5 * step, 0
             continue
         points += list(_points_between(line, last, new))
         rows.append(new)
-        step = min(LONGEST_STEP_OF_BRANCH, 1.5 * step)
-        tangent, last = solved.tangent, new
-        leg, u = leg.going_on(new)
-    return rows, points, None
+        straight += 1
+        # Towards a border steps become shorter and shorter.
+        step = min(LONGEST_STEP_OF_BRANCH, 1.5 * step) if straight > STRAIGHT_ROWS else step
+        leg, u, tangent = leg.going_on(new, solved.tangent)
+        last = new
+    if len(rows) < MOST_MOTIONS:
+        # Newton's method may fail before the signature ends.
+        ahead = u + FIRST_STEP_OF_BRANCH * tangent
+        value, start = float(line.length * ahead[-1]), leg.start(ahead)
+        point = _border(line, _borders(line, last), last, value, start)
+        if point is not None:
+            return rows, [*points, point], _beyond_point(line, last, point, tangent[-1])
+    return rows, points, last.value
 
 
 def _at_end(
@@ -298,15 +330,23 @@ def _past_phase(
     return MotionRow(value, motion) if events in turns and away <= apart else None
 
 
-def _border(
-    line: ForcedLine, last: MotionRow, value: float, start: np.ndarray
-) -> BifurcationPoint | None:
-    """The point in which the signature of the last motion ends on the way to another value, and to
-    another state at the phase 0, None where the conditions find none so near."""
-    belts = range(last.motion.chain.codes.shape[-1])
+def _borders(line: ForcedLine, row: MotionRow) -> list[BifurcationPoint]:
+    """Points near to a motion in which its signature may end."""
+    belts = range(row.motion.chain.codes.shape[-1])
     kinds: list[Any] = [GrazingSliding, CrossingSliding, SwitchingSliding, AddingSliding]
-    found = [p for k in kinds for belt in belts for p in _points(line, k(belt), last)]
-    near = [p for p in found if _is_between(line, p, last, value, start)]
+    return [p for k in kinds for belt in belts for p in _points(line, k(belt), row)]
+
+
+def _border(
+    line: ForcedLine,
+    borders: list[BifurcationPoint],
+    last: MotionRow,
+    value: float,
+    start: np.ndarray,
+) -> BifurcationPoint | None:
+    """The one of these points in which the signature of the last motion ends on the way to another
+    value, and to another state at the phase 0, None where none is so near."""
+    near = [p for p in borders if _is_between(line, p, last, value, start)]
     change = value - last.value
     ahead = [p for p in near if (float(p.value) - last.value) * change >= -1e-9 * line.length]
     return min(ahead, key=lambda p: abs(float(p.value) - last.value), default=None)
@@ -315,7 +355,9 @@ def _border(
 def _beyond_point(
     line: ForcedLine, last: MotionRow, point: BifurcationPoint, direction: float
 ) -> tuple[MotionRow, float] | None:
-    """A motion beyond the point in which a signature ended, and the sense in which to go on."""
+    """A motion beyond the point in which a signature ended, and the sense in which to go on;
+    direction: the sign is that in which the parameter went."""
+    direction = float(np.sign(direction))
     at, value = np.asarray(point.cycle.start), float(point.value)
     periods = last.motion.periods
     moved = at - np.asarray(last.motion.start)

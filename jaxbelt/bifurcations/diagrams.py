@@ -149,6 +149,8 @@ class BifurcationDiagram(eqx.Module):
         as_paper: Whether the path lies in the plane of the paper's Fig. 6, so that pictures show
             the names of the regions.
         is_argument: Whether `name` is that of a function's argument.
+        open_ends: Values inside of the span at which a branch of a forced oscillator ends, and no
+            point says why: its motion could not be followed further.
     """
 
     points: tuple[BifurcationPoint, ...]
@@ -158,6 +160,7 @@ class BifurcationDiagram(eqx.Module):
     name: str = eqx.field(static=True)
     as_paper: bool = eqx.field(static=True, default=False)
     is_argument: bool = eqx.field(static=True, default=False)
+    open_ends: tuple[float, ...] = ()
 
     def table(self) -> "pandas.DataFrame":
         """Returns a row for each row of each branch, in order, and then for each special point.
@@ -208,9 +211,11 @@ class BifurcationDiagram(eqx.Module):
 
     def __repr__(self) -> str:
         names = " | ".join(name for _, _, name in self.regions)
+        ends = ", ".join(f"{value:.6g}" for value in self.open_ends)
         return (
             f"BifurcationDiagram({self.name}, {len(self.points)} points, "
-            f"{len(self.branches)} branches, regions {names})"
+            f"{len(self.branches)} branches, regions {names}"
+            f"{f', not followed beyond {ends}' if ends else ''})"
         )
 
 
@@ -237,7 +242,8 @@ def bifurcation_diagram(
             stable and unstable, with the points on it, and the branches that leave it at period
             doublings (rows and resolution do not count): that motion, or a start (x1, x2) at t = 0
             that leads to it with the parameter in the middle of the span; None: from where one is
-            found. A branch ends where no motion is found beyond a point.
+            found. A branch ends where no motion is found beyond a point, or where it cannot be
+            followed further, see `open_ends`.
 
     Returns:
         The `BifurcationDiagram`.
@@ -322,7 +328,8 @@ def _forced_diagram(osc: Any, where: Any, span: Any, start: Any) -> BifurcationD
     limits = np.array([[first, last]]) / unit
     motion, value = _start_of_branch(variation, limits, start)
     found, points = forced_branches(variation, (limits[0, 0], limits[0, 1]), motion, value)
-    branches = rescaled(tuple(map(_branch_of_motions, found)), length)
+    branches = rescaled(tuple(_branch_of_motions(one.rows) for one in found), length)
+    open_ends = [end * float(unit) for one in found for end in one.open_ends]
     return BifurcationDiagram(
         points=tuple(given_point(point, variation) for point in points),
         branches=tuple(replace(one, values=one.values * unit) for one in branches),
@@ -331,6 +338,7 @@ def _forced_diagram(osc: Any, where: Any, span: Any, start: Any) -> BifurcationD
         name=variation.names[0],
         as_paper=False,
         is_argument=not variation.varies_leaves,
+        open_ends=tuple(open_ends),
     )
 
 

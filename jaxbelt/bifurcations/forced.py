@@ -74,6 +74,10 @@ from .systems import (
 
 #: Places of a motion from which a condition is tried, the most promising ones first.
 TRIED = 3
+#: Minima of guards earlier than this part of an arc are those at which it began.
+AT_ONSET = 1e-6
+#: Stick phases whose durations differ by a smaller part may be images of one another.
+ALIKE = 0.1
 #: A multiplier that is off by less is the one that the condition asks for.
 ON_CIRCLE = 1e-6
 #: States from which motions are looked for, in own units.
@@ -267,6 +271,19 @@ class ArcRows(NamedTuple):
         codes, z = self.codes[row], self.z[row]
         first = (codes, end, np.append(z[:3], since))
         return self.put(row, row, first, (codes, self.ends[row], np.append(state, z[3] - since)))
+
+    def without_stick(self, row: int, end: int | None) -> "ArcRows":
+        """Without the stick phase of a row: the slip arc before goes on, cut in its middle by an
+        end; None: not cut."""
+        last, phase, then = self.z[row - 1 : row + 2]
+        codes, half = self.codes[row - 1], 0.5 * phase[3]
+        if end is None:
+            whole = (codes, self.ends[row + 1], np.append(last[:3], last[3] + phase[3] + then[3]))
+            return self.put(row - 1, row + 1, whole)
+        middle = phase[:3] + half * np.array([phase[1], 0.0, 1.0])
+        first = (codes, end, np.append(last[:3], last[3] + half))
+        second = (codes, self.ends[row + 1], np.append(middle, then[3] + half))
+        return self.put(row - 1, row + 1, first, second)
 
     def loop(self) -> Loop:
         empty = np.zeros((0, 2))
@@ -509,22 +526,34 @@ class TimedGrazing(AbstractForcedCondition):
             row = int(np.flatnonzero(rows.ends == names.tangent + k)[0])
             yield Beginning(rows, 0.0, system(row))
             return
-        for row in range(1, len(rows.ends) - 1):
-            before, here, after = rows.codes[row - 1 : row + 2]
-            alone = here[k] == STUCK and np.all(before == after) and abs(before[k]) == 1
-            if alone and rows.ends[row - 1] == k and rows.ends[row] == names.onset:
-                # A stick phase that is left out, cut in its middle.
-                last, phase, then = rows.z[row - 1 : row + 2]
-                half = 0.5 * phase[3]
-                middle = phase[:3] + half * np.array([phase[1], 0.0, 1.0])
-                first = (before, names.tangent + k, np.append(last[:3], last[3] + half))
-                second = (after, rows.ends[row + 1], np.append(middle, then[3] + half))
-                shorter = rows.put(row - 1, row + 1, first, second)
-                yield Beginning(shorter, float(phase[3]) ** 2, system(row - 1))
+        short = [row for row in range(1, len(rows.ends) - 1) if self._may_end(rows, row)]
+        for row in short:
+            duration = rows.z[row, 3]
+            alike = [i for i in short if abs(rows.z[i, 3] - duration) < ALIKE * duration]
+            # Those of a symmetric motion end at once, and each touches only where the others do.
+            for left_out in [alike, [row]] if len(alike) > 1 else [[row]]:
+                shorter = rows
+                for i in reversed(left_out):
+                    shorter = shorter.without_stick(i, names.tangent + k if i == row else None)
+                at = row - 1 - 2 * sum(i < row for i in left_out)
+                yield Beginning(shorter, float(duration) ** 2, system(at))
         for row, since, state, value in _turns(osc, motion, lambda guards: guards[k : k + 1]):
             if abs(rows.codes[row, k]) == 1:
                 cut = rows.cut(row, since, state, names.tangent + k)
                 yield Beginning(cut, value, system(row))
+
+    def _may_end(self, rows: ArcRows, row: int) -> bool:
+        """Whether an arc is a stick phase to the belt alone from which the slip before goes on."""
+        before, here, after = rows.codes[row - 1 : row + 2, self.belt]
+        others = np.delete(rows.codes[row - 1 : row + 2], self.belt, axis=1)
+        alone = (
+            here == STUCK
+            and before == after
+            and abs(before) == 1
+            and not np.any(np.ptp(others, axis=0))
+        )
+        onset = Ends(rows.codes.shape[1]).onset
+        return bool(alone and rows.ends[row - 1] == self.belt and rows.ends[row] == onset)
 
 
 class _AtArrival(AbstractForcedCondition):
@@ -651,5 +680,7 @@ def _turns(osc: Oscillator, motion: PeriodicMotion, of: Any) -> Iterator[tuple]:
             for i in np.flatnonzero(falls & (np.diff(times) > 0)).tolist():
                 part = slopes[i] / (slopes[i] - slopes[i + 1])
                 state = states[row, i] + part * (states[row, i + 1] - states[row, i])
-                least = float(min(values[i], values[i + 1]))
-                yield row, float(state[2] - times[0]), state, abs(least)
+                since = float(state[2] - times[0])
+                # At slip onset a guard begins at a minimum, and its slope is rounding there.
+                if since > AT_ONSET * (times[-1] - times[0]):
+                    yield row, since, state, abs(float(min(values[i], values[i + 1])))
