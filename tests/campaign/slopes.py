@@ -18,6 +18,8 @@ from .outcome import Outcome
 
 #: Steps of the differences, and what they may be off: values are known to 1e-11 or so.
 STEP, ROOM = 2e-4, 1e-5
+#: After so many paths compiled programs are dropped: a thousand of them fill the memory.
+TOGETHER = 10
 
 
 def settings(options) -> dict:
@@ -31,6 +33,8 @@ def numbers(options) -> range:
 def outcome(options, number: int) -> Outcome:
     """Differentiate all points of one path."""
     case = paths.case_of(options.seed, number)
+    if number % TOGETHER == 0:
+        jax.clear_caches()
     rng = np.random.default_rng((options.seed, number, 1))
     middle = package.oscillator(case.at(0.5 * sum(case.span)))
     points = [p for p in jb.scan(middle, case.where, case.span) if p.status == jb.Status.OK]
