@@ -19,7 +19,7 @@ from jaxtyping import Array
 
 from ..activity import note_progress
 from ..cycles.clocked import TimedChain, timed_blocks, turns_of
-from ..cycles.periodic import PeriodicMotion, is_same_motion, motion_near, periodic_from
+from ..cycles.periodic import PeriodicMotion, is_same_motion, motion_at_unknowns, periodic_from
 from ..cycles.shooting import jacobian
 from ..model.oscillator import Oscillator
 from ..model.own_units import in_own_units
@@ -154,7 +154,7 @@ class MotionLeg(NamedTuple):
     def row(self, u: np.ndarray) -> MotionRow:
         z = jnp.asarray(u[:-1] / np.asarray(self.weights)).reshape(-1, 4)
         value = float(self.line.length * u[-1])
-        return MotionRow(value, motion_near(self.line.at(value), self.chain, z))
+        return MotionRow(value, motion_at_unknowns(self.line.at(value), self.chain, z))
 
     def going_on(
         self, row: MotionRow, tangent: np.ndarray
@@ -192,7 +192,7 @@ def _side_of_point(
         points += found
         if further is None:
             return MotionBranch(rows, []), points
-        if isinstance(further, float):
+        if not isinstance(further, tuple):
             return MotionBranch(rows, [further]), points
         new, sign = further
         rows.append(new)

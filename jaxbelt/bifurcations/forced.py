@@ -77,7 +77,7 @@ TRIED = 3
 #: Minima of guards earlier than this part of an arc are those at which it began.
 AT_ONSET = 1e-6
 #: Stick phases whose durations differ by a smaller part may be images of one another.
-ALIKE = 0.1
+ALIKE_STICKS = 0.1
 #: A multiplier that is off by less is the one that the condition asks for.
 ON_CIRCLE = 1e-6
 #: States from which motions are looked for, in own units.
@@ -529,7 +529,7 @@ class TimedGrazing(AbstractForcedCondition):
         short = [row for row in range(1, len(rows.ends) - 1) if self._may_end(rows, row)]
         for row in short:
             duration = rows.z[row, 3]
-            alike = [i for i in short if abs(rows.z[i, 3] - duration) < ALIKE * duration]
+            alike = [i for i in short if abs(rows.z[i, 3] - duration) < ALIKE_STICKS * duration]
             # Those of a symmetric motion end at once, and each touches only where the others do.
             for left_out in [alike, [row]] if len(alike) > 1 else [[row]]:
                 shorter = rows

@@ -204,7 +204,7 @@ class PeriodicMotion(eqx.Module):
             z = jnp.concatenate([own.units.into(z[..., :2]), z[..., 2:]], axis=-1)
         z = lax.stop_gradient(z)
         if is_concrete((own, self)) and z.ndim == 2:
-            return in_given_units(motion_near(own, self.chain, z), osc, own)
+            return in_given_units(motion_at_unknowns(own, self.chain, z), osc, own)
         found, error = _polished_motion(own, self.chain, z)
         found = _known_where(found, error < HOLDS)
         return in_given_units(found, osc, own)
@@ -459,7 +459,7 @@ def solved_from(osc: Oscillator, loop: Loop, turns: int) -> PeriodicMotion:
     return motion
 
 
-def motion_near(osc: Oscillator, chain: TimedChain, z: Array) -> PeriodicMotion:
+def motion_at_unknowns(osc: Oscillator, chain: TimedChain, z: Array) -> PeriodicMotion:
     """The motion near the unknowns of a chain, which may be another oscillator's: with steps of its
     own where those of the chain leave an error."""
     motion, error = _polished_motion(osc, chain, z)
