@@ -136,6 +136,14 @@ class MotionLeg(NamedTuple):
         u = np.append(weights * z.reshape(-1), row.value / line.length)
         return cls(line, row.motion.chain, jnp.asarray(weights)), u
 
+    @classmethod
+    def begun(cls, line: ForcedLine, row: MotionRow) -> tuple["MotionLeg", Corrected]:
+        """The leg of a row, and the unknowns and the tangent of the row, if they are found."""
+        leg, u = cls.of(line, row)
+        axis = np.zeros_like(u)
+        axis[-1] = 1.0
+        return leg, leg.corrected(u, axis, 0.0)
+
     def corrected(self, u: np.ndarray, tangent: np.ndarray, length: float) -> Corrected:
         """As `continuation.corrected`."""
         unit = self.line.length
@@ -208,10 +216,7 @@ def _branch_leg(
     parameter goes from it. It is None where the branch leaves the span, or ends in a point, and a
     value where it ends otherwise.
     """
-    leg, u = MotionLeg.of(line, row)
-    axis = np.zeros_like(u)
-    axis[-1] = 1.0
-    begun = leg.corrected(u, axis, 0.0)
+    leg, begun = MotionLeg.begun(line, row)
     if not begun.found:
         return [], [], row.value
     u, tangent = begun.u, sign * begun.tangent * np.sign(begun.tangent[-1])
@@ -373,9 +378,10 @@ def _beyond_point(
                 fine = int(motion.status) == Status.OK and motion.periods == periods
                 if not fine or np.max(np.abs(np.asarray(motion.start) - at)) > NEAR_POINT:
                     continue
-                if own is not None and is_same_motion(own, motion):
-                    continue
-                return MotionRow(there, motion), side * direction
+                row = MotionRow(there, motion)
+                same = own is not None and is_same_motion(own, motion)
+                if not same and MotionLeg.begun(line, row)[1].found:
+                    return row, side * direction
     return None
 
 

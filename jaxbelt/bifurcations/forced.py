@@ -543,14 +543,13 @@ class TimedGrazing(AbstractForcedCondition):
                 yield Beginning(cut, value, system(row))
 
     def _may_end(self, rows: ArcRows, row: int) -> bool:
-        """Whether an arc is a stick phase to the belt alone from which the slip before goes on."""
-        before, here, after = rows.codes[row - 1 : row + 2, self.belt]
-        others = np.delete(rows.codes[row - 1 : row + 2], self.belt, axis=1)
+        """Whether an arc is a stick phase to the belt, or to more belts of its velocity, from which
+        the slip before goes on."""
+        codes = rows.codes[row - 1 : row + 2]
+        before, here, after = codes[:, self.belt]
+        differ = codes[:, np.any(codes != codes[:, [self.belt]], axis=0)]
         alone = (
-            here == STUCK
-            and before == after
-            and abs(before) == 1
-            and not np.any(np.ptp(others, axis=0))
+            here == STUCK and before == after and abs(before) == 1 and not np.ptp(differ, 0).any()
         )
         onset = Ends(rows.codes.shape[1]).onset
         return bool(alone and rows.ends[row - 1] == self.belt and rows.ends[row] == onset)

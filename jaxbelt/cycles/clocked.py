@@ -58,6 +58,8 @@ RATIOS = 64
 RATIO_ROUNDING = 1e-14
 #: A boundary or limit that is passed by less is touched.
 TOUCHES_AGAIN = 1e-8
+#: A guard that rises faster where an arc ends has been zero before.
+COMES_BACK = 1e-6
 #: Newton steps from where a quintic has an extremum to where the motion has it.
 EXTREMUM_STEPS = 2
 
@@ -480,9 +482,20 @@ def _least(
     return function(state(s))
 
 
+def _guard_slope(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
+    """How fast the guard that ends an arc rises there; 0 of arcs that end otherwise."""
+    mode, names = mode_of(codes), Ends(len(osc.belts))
+    at = trend_of(osc, mode, lambda y: guards_at(osc, mode, y), (y[0], y[1], y[2]))
+    count = at.value.size - 2
+    limit = count + jnp.argmin(at.value[count:])
+    place = jnp.where(end == names.onset, limit, jnp.clip(end, 0, count - 1))
+    slope = jnp.nan_to_num(at.slope[place], nan=0.0)
+    return jnp.where((end < count) | (end == names.onset), slope, 0.0)
+
+
 def timed_admissible(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
     """Whether the oscillator moves along a solution of the equations: no arc leaves its mode before
-    its end, and none crosses a boundary where the mass would stick."""
+    its end, or comes back to it there, and none crosses a boundary where the mass would stick."""
     n = len(osc.belts)
 
     def one(osc, codes, mesh, end, after, unknown):
@@ -495,7 +508,8 @@ def timed_admissible(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
         crosses = (end < n) & ~jnp.any(after == 0) & jnp.any(flips)
         would_stick = crosses & (needed < capacity(now, held) - TOUCHES_AGAIN)
         least = least_guard(osc, codes, mesh, y, duration)
-        return (duration >= -HOLDS) & (least >= -TOUCHES_AGAIN) & ~would_stick
+        late = _guard_slope(osc, codes, end, end_state) > COMES_BACK
+        return (duration >= -HOLDS) & (least >= -TOUCHES_AGAIN) & ~late & ~would_stick
 
     columns = chain.codes, chain.mesh, chain.ends, following_codes(chain), z
     each = arc_by_arc(one)((osc,), columns)
