@@ -255,7 +255,9 @@ def _branch_leg(
         # Newton's method may fail before the signature ends.
         ahead = u + FIRST_STEP_OF_BRANCH * tangent
         value, start = float(line.length * ahead[-1]), leg.start(ahead)
-        point = _border(line, _borders(line, last), last, value, start)
+        within = FIRST_STEP_OF_BRANCH * line.length
+        near = [p for p in _borders(line, last) if abs(float(p.value) - last.value) < within]
+        point = _border(line, near, last, value, start)
         if point is not None:
             return rows, [*points, point], _beyond_point(line, last, point, tangent[-1])
     return rows, points, last.value
