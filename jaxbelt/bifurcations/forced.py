@@ -76,8 +76,8 @@ from .systems import (
 TRIED = 3
 #: Minima of guards earlier than this part of an arc are those at which it began.
 AT_ONSET = 1e-6
-#: Stick phases whose durations differ by a smaller part may be images of one another.
-ALIKE_STICKS = 0.1
+#: Arcs whose durations differ by a smaller part may be images of one another.
+ALIKE_ARCS = 0.1
 #: A multiplier that is off by less is the one that the condition asks for.
 ON_CIRCLE = 1e-6
 #: States from which motions are looked for, in own units.
@@ -272,9 +272,9 @@ class ArcRows(NamedTuple):
         first = (codes, end, np.append(z[:3], since))
         return self.put(row, row, first, (codes, self.ends[row], np.append(state, z[3] - since)))
 
-    def without_stick(self, row: int, end: int | None) -> "ArcRows":
-        """Without the stick phase of a row: the slip arc before goes on, cut in its middle by an
-        end; None: not cut."""
+    def without(self, row: int, end: int | None) -> "ArcRows":
+        """Without the short arc of a row: the one before goes on, cut in the middle of the short
+        one by an end; None: not cut."""
         last, phase, then = self.z[row - 1 : row + 2]
         codes, half = self.codes[row - 1], 0.5 * phase[3]
         if end is None:
@@ -527,16 +527,8 @@ class TimedGrazing(AbstractForcedCondition):
             yield Beginning(rows, 0.0, system(row))
             return
         short = [row for row in range(1, len(rows.ends) - 1) if self._may_end(rows, row)]
-        for row in short:
-            duration = rows.z[row, 3]
-            alike = [i for i in short if abs(rows.z[i, 3] - duration) < ALIKE_STICKS * duration]
-            # Those of a symmetric motion end at once, and each touches only where the others do.
-            for left_out in [alike, [row]] if len(alike) > 1 else [[row]]:
-                shorter = rows
-                for i in reversed(left_out):
-                    shorter = shorter.without_stick(i, names.tangent + k if i == row else None)
-                at = row - 1 - 2 * sum(i < row for i in left_out)
-                yield Beginning(shorter, float(duration) ** 2, system(at))
+        for shorter, row, value in _left_out(rows, short, names.tangent + k):
+            yield Beginning(shorter, value, system(row))
         for row, since, state, value in _turns(osc, motion, lambda guards: guards[k : k + 1]):
             if abs(rows.codes[row, k]) == 1:
                 cut = rows.cut(row, since, state, names.tangent + k)
@@ -647,21 +639,35 @@ class AddingSliding(AbstractForcedCondition):
             row = int(np.flatnonzero(rows.ends == names.nearest_limit)[0])
             yield Beginning(rows, 0.0, system(row, rows.codes[row]))
             return
+        short = []
         for row in range(1, len(rows.ends) - 1):
             before, here, after = rows.codes[row - 1 : row + 2]
             alone = before[k] == STUCK and np.all(before == after) and abs(here[k]) == 1
             if alone and rows.ends[row - 1] == names.onset and rows.ends[row] == k:
-                last, phase, then = rows.z[row - 1 : row + 2]
-                half = 0.5 * phase[3]
-                middle = phase[:3] + half * np.array([phase[1], 0.0, 1.0])
-                first = (before, names.nearest_limit, np.append(last[:3], last[3] + half))
-                second = (after, rows.ends[row + 1], np.append(middle, then[3] + half))
-                shorter = rows.put(row - 1, row + 1, first, second)
-                yield Beginning(shorter, float(phase[3]) ** 2, system(row - 1, before))
+                short.append(row)
+        for shorter, row, value in _left_out(rows, short, names.nearest_limit):
+            yield Beginning(shorter, value, system(row, shorter.codes[row]))
         for row, since, state, value in _turns(osc, motion, lambda guards: guards[-2:]):
             if rows.codes[row, k] == STUCK:
                 cut = rows.cut(row, since, state, names.nearest_limit)
                 yield Beginning(cut, value, system(row, rows.codes[row]))
+
+
+def _left_out(rows: ArcRows, short: list[int], end: int) -> Iterator[tuple[ArcRows, int, float]]:
+    """The arcs without one of some that may end, cut there by an end; the row that is cut;
+    and the square of the duration that is left out.
+
+    Arcs of one duration are left out together first: those of a symmetric motion end at once, and
+    one touches only where the others do.
+    """
+    for row in short:
+        duration = rows.z[row, 3]
+        alike = [i for i in short if abs(rows.z[i, 3] - duration) < ALIKE_ARCS * duration]
+        for some in [alike, [row]] if len(alike) > 1 else [[row]]:
+            shorter = rows
+            for i in reversed(some):
+                shorter = shorter.without(i, end if i == row else None)
+            yield shorter, row - 1 - 2 * sum(i < row for i in some), float(duration) ** 2
 
 
 def _turns(osc: Oscillator, motion: PeriodicMotion, of: Any) -> Iterator[tuple]:

@@ -15,10 +15,11 @@ from .options import (
     Interval,
     Json,
     Out,
+    Vary,
+    VarySpan,
     as_json_value,
     check_range,
     describes,
-    from_to,
     make_console,
     outputs,
     plain_errors,
@@ -38,18 +39,8 @@ FIELDS = ("stable", "x1_min", "x1_max", "x2_min", "x2_max", "period", "multiplie
 @describes()
 def diagram(
     described: Description,
-    parameter: Annotated[
-        str,
-        typer.Option(
-            "--vary",
-            help="The parameter: nu0, nu1, ..., zeta, sigma, sigma0, sigma1, or its path, such as "
-            "belts[1].friction.steepness.",
-        ),
-    ] = "nu0",
-    span: Annotated[Interval, from_to("Its first and last value; of a machine in its SI unit.")] = (
-        -0.7,
-        0.7,
-    ),
+    parameter: Vary = "nu0",
+    span: VarySpan = (-0.7, 0.7),
     start: Annotated[
         Interval | None,
         typer.Option(

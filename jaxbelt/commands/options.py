@@ -265,6 +265,17 @@ def from_to(text: str) -> Any:
     return typer.Option(metavar="FROM TO", help=text)
 
 
+Vary = Annotated[
+    str,
+    typer.Option(
+        "--vary",
+        help="The parameter: nu0, nu1, ..., zeta, sigma, sigma0, sigma1, or its path, such as "
+        "belts[1].friction.steepness or forcing[0].frequency.",
+    ),
+]
+VarySpan = Annotated[Interval, from_to("Its first and last value; of a machine in its SI unit.")]
+
+
 @dataclass(frozen=True)
 class Description:
     """Oscillator that options describe: a class of the paper with its arguments, belts in full, or

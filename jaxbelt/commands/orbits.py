@@ -12,13 +12,13 @@ import jaxbelt as jb
 from ..spelling import did_you_mean
 from .options import (
     Description,
-    Interval,
     Json,
     Out,
     Start,
+    Vary,
+    VarySpan,
     check_range,
     describes,
-    from_to,
     make_console,
     outputs,
     plain_errors,
@@ -33,18 +33,8 @@ COORDINATES = ("x1", "x2")
 @describes()
 def orbits(
     described: Description,
-    parameter: Annotated[
-        str,
-        typer.Option(
-            "--vary",
-            help="The parameter: nu0, nu1, ..., zeta, sigma, sigma0, sigma1, or its path, such as "
-            "forcing[0].frequency.",
-        ),
-    ] = "nu0",
-    span: Annotated[Interval, from_to("Its first and last value; of a machine in its SI unit.")] = (
-        -0.7,
-        0.7,
-    ),
+    parameter: Vary = "nu0",
+    span: VarySpan = (-0.7, 0.7),
     rows: Annotated[int, typer.Option(help="How many values, evenly spread.")] = 400,
     start: Start = None,
     also: Annotated[

@@ -205,8 +205,7 @@ class PeriodicMotion(eqx.Module):
         z = lax.stop_gradient(z)
         if is_concrete((own, self)) and z.ndim == 2:
             return in_given_units(motion_at_unknowns(own, self.chain, z), osc, own)
-        found, error = _polished_motion(own, self.chain, z)
-        found = _known_where(found, error < HOLDS)
+        found, _ = _polished_motion(own, self.chain, z, jnp.asarray(HOLDS))
         return in_given_units(found, osc, own)
 
     def row(self) -> dict[str, Any]:
@@ -396,9 +395,10 @@ def after_period(osc: Oscillator, followed: Followed) -> np.ndarray:
 
 @jit
 def _polished_motion(
-    osc: Oscillator, chain: TimedChain, guess: Array
+    osc: Oscillator, chain: TimedChain, guess: Array, most: Any = np.inf
 ) -> tuple[PeriodicMotion, Array]:
-    """The motion near a guess of a chain's unknowns, and the error that its steps leave."""
+    """The motion near a guess of a chain's unknowns, and the error that its steps leave; with more
+    than `most` of it there is none."""
     solved = solve_timed(osc, chain, guess)
     z, settled = solved.z, solved.unsettled
     still, at = lax.stop_gradient((osc, z))
@@ -409,7 +409,7 @@ def _polished_motion(
     values = lax.map(lambda m: timed_residual(still, replace(chain, mesh=m), at), meshes)
     error = jnp.max(jnp.abs(values[0] - values[1]))
     residual = jnp.max(jnp.abs(values[0]))
-    fine = (residual < HOLDS) & (settled < HOLDS)
+    fine = (residual < HOLDS) & (settled < HOLDS) & (error <= most)
     status = jnp.where(fine, Status.OK.value, Status.NO_CONVERGENCE.value)
     # Where it sticks all along, no place is better than another.
     always = jnp.all(jnp.any(chain.codes == STUCK, axis=-1) | ~chain.used)
@@ -467,20 +467,6 @@ def motion_at_unknowns(osc: Oscillator, chain: TimedChain, z: Array) -> Periodic
     if not converged or float(error) < EXACT_MOTION:
         return motion
     return solved_from(osc, Loop(chain.codes, chain.ends, z[:, :3], z[:, 3]), chain.turns)
-
-
-def _known_where(motion: PeriodicMotion, fine: Array) -> PeriodicMotion:
-    """The motion, NaN with NO_CONVERGENCE where it is not fine."""
-    status = jnp.where(fine, motion.status, Status.NO_CONVERGENCE.value)
-    status = jnp.where(motion.status == Status.OK, status, motion.status)
-    known = jnp.where(status == Status.OK, 1.0, jnp.nan)
-    return replace(
-        motion,
-        unknowns=motion.unknowns * known,
-        multipliers=motion.multipliers * known.astype(complex),
-        residual=motion.residual * known,
-        status=status,
-    )
 
 
 def nothing_found(osc: Oscillator, turns: int, status: int) -> PeriodicMotion:
