@@ -121,14 +121,16 @@ def test_a_belt_at_rest_holds_what_comes_to_it():
 
 @pytest.mark.slow(first=True)
 def test_labels_tell_attractors_of_one_kind_apart():
-    """Cycles by where they are; the most frequent first; undecided is -1."""
+    """Cycles by where they are; the most frequent first; undecided is none."""
     dataset = jb.sweep(lambda: belt_drive(1.4), {"x1": [0.0] * 5, "x2": [2.0]}, observe="attractor")
     dataset = dataset.load()
     dataset["kind"][:, 0] = [1, 0, 2, 2, 2]  # equilibrium, undecided, cycle ...
     dataset["x1_max"][:, 0] += [0.0, 0.0, 0.0, 1e-9, 0.0]
-    labels, names, cycles = _labels(belt_drive(1.4), dataset)
-    assert labels[:, 0].tolist() == [1, -1, 0, 0, 0]
-    assert names[0] == "cycle that sticks to belt 0" and len(cycles) == 1
+    cycle, rest = _labels(belt_drive(1.4), dataset)
+    assert cycle.runs[:, 0].tolist() == [False, False, True, True, True]
+    assert rest.runs[:, 0].tolist() == [True, False, False, False, False]
+    assert cycle.name == "cycle that sticks to belt 0"
+    assert cycle.cycle is not None and rest.cycle is None
 
 
 @pytest.mark.slow
