@@ -69,6 +69,27 @@ def test_the_number_of_periods_is_the_least(frequency):
     assert np.max(np.abs(start - once)) > 0.1 and start == pytest.approx(twice, abs=1e-9)
 
 
+@pytest.mark.slow(first=True)
+def test_the_number_of_periods_near_a_fold_is_the_least():
+    """Two belts of one velocity; the multiplier comes near to 1, and rounding moves the state by
+    1e-9 a Newton step. Runs from there come back after two periods."""
+    belts = (
+        jb.Belt(-1.0, jb.Conti(1.0, 0.6, 10.0), 2.0),
+        jb.Belt(-1.0, jb.Coulomb(1.0, 0.8), 1.5),
+    )
+    osc = jb.Oscillator(0.1, belts, forcing=jb.Harmonic(2.26832, 0.5, 1.5 * np.pi))
+    found = jb.find_cycle(osc, (0.65, 0.6))
+    assert int(found.status) == OK and found.periods == 2
+    assert 0.99 < float(found.multipliers[0].real) < 1
+    run = jb.simulate(osc, tuple(np.asarray(found.start)), t1=float(found.period))
+    # The tolerance of `simulate` is 1e-10 here: four of them.
+    assert np.asarray(run.ys[-1]) == pytest.approx(np.asarray(found.start), abs=4e-10)
+    diagram = jb.bifurcation_diagram(
+        osc, lambda osc: osc.forcing[0].amplitude, (2.266, 2.27), rows=8, start=found
+    )
+    assert len(diagram.branches) == 1 and not diagram.open_ends
+
+
 def test_motions_and_multipliers_are_those_of_the_engine(smooth, sticking):
     # Differences of runs at 1e-13; the state is 3e-5 from grazing, so the step is small.
     for motion, frequency, h in ((smooth, 1.7079, 1e-6), (sticking, 1.68, 1e-4)):
