@@ -288,18 +288,24 @@ def _meeting(curve: Polynomial, doubt, rounding, ends, h, room, reach, number) -
     `step.LANDS_WITHIN`."""
     (_, slope0), (value, slope) = ends
     met = passage(curve, doubt, rounding, h < SHORTEST_TIMED_STEP * reach)
-    bend = (slope - slope0) / jnp.where(h > 0, h, 1.0)
+    bend = (slope - slope0) * _inverse(h)
     falls = slope < 0
     near = jnp.abs(value) * jnp.maximum(-slope, SLOW * jnp.abs(bend)) <= reach * slope * slope
     straight = value * value * jnp.abs(bend) * h <= room * slope * slope
     # Where it only touches, within rounding, no Taylor step leads to it.
     depth = jnp.where(bend > 0, 0.5 * slope * slope / jnp.where(bend > 0, bend, 1.0), jnp.inf)
     near = near & falls & straight & (value - depth < -rounding)
-    delta = -value / jnp.where(near, slope, 1.0)
-    delta = delta - 0.5 * bend * delta * delta / jnp.where(near, slope, 1.0)
+    per_slope = 1.0 / jnp.where(near, slope, 1.0)
+    delta = -value * per_slope
+    delta = delta - 0.5 * bend * delta * delta * per_slope
     return _GuardMeeting(
         met.once, met.cut, met.there, jnp.where(near, delta, NEVER), jnp.asarray(number)
     )
+
+
+def _inverse(h: Array) -> Array:
+    """1/h of the lanes that make a step: one division serves all guards."""
+    return 1.0 / jnp.where(h > 0, h, 1.0)
 
 
 def _quartic(start, end, change, h) -> list[Array]:
@@ -308,7 +314,7 @@ def _quartic(start, end, change, h) -> list[Array]:
     (f0, s0), (f1, s1) = start, end
     m0, m1 = h * s0, h * s1
     rise = f1 - f0
-    k4 = 30 * (change / jnp.where(h > 0, h, 1.0) - 0.5 * (f0 + f1) - (m0 - m1) / 12)
+    k4 = 30 * (change * _inverse(h) - 0.5 * (f0 + f1) - (m0 - m1) / 12)
     k4 = jnp.where(h < SHORT_TIMED_STEP, 0.0, k4)
     c2, c3 = 3 * rise - 2 * m0 - m1, m0 + m1 - 2 * rise
     return [f0, m0, c2 + k4, c3 - 2 * k4, k4]
