@@ -112,7 +112,8 @@ def forced_branches(
 
 def _is_known_motion(point: BifurcationPoint, other: BifurcationPoint, line: ForcedLine) -> bool:
     close = abs(float(point.value) - float(other.value)) < 1e-8 * line.length
-    return close and type(point.condition) is type(other.condition) and _same(point, other)
+    alike = type(point.condition) is type(other.condition)
+    return bool(close and alike and _same(point, other))
 
 
 def _same(point: BifurcationPoint, other: BifurcationPoint) -> bool:
