@@ -119,7 +119,7 @@ def test_a_branch_ends_where_a_mass_begins_to_stick_by_grazing():
             forced_cases.stroboscopic(twins_of_engine(float(point.value) + off), first, periods)
             for off in (1e-7, -1e-7)
         ]
-        # To one side of the point it comes back, but for the root of 1e-7; to the other it does not.
+        # To one side it comes back, but for the root of 1e-7; to the other it does not.
         away = sorted(np.max(np.abs(np.subtract(run.y_end, first))) for run in sides)
         assert away[0] < 0.01 and away[1] > 0.1
 
