@@ -13,8 +13,8 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     numerics/       spacing widths programs compiling
     checks          arguments, checked at the public edge
     tables          results as tables
-    numerics/       padding derivatives extrapolation newton continuation roots
-    numerics/       control_points
+    numerics/       padding derivatives implicit extrapolation newton continuation
+    numerics/       roots control_points
     model/          friction forcing oscillator own_units machine parameters variations modes
     model/          pseudofocus transitions instants rest events equilibria far_out
     presets         the published systems

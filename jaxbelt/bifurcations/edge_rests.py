@@ -214,12 +214,13 @@ def pseudo_hopf_limit(trail: Trail) -> SpecialPoint | None:
 def _degenerate_focus(family: Family, edge: Array, guess: Array) -> tuple[Array, Array]:
     """Both parameters of such a pseudo-focus, and the error."""
 
-    def equations(family, p):
+    def equations(given, p):
+        family, edge = given
         osc = family.at(p)
         system = EdgeBalance(edge, *_beside_edge(osc, jnp.stack(edges(osc))[edge]))
         return jnp.stack([system.balance(osc), system.growth(osc)[0]])
 
-    found, _, residual, _ = small_newton(equations, family, guess)
+    found, _, residual, _ = small_newton(equations, (family, edge), guess)
     return found, residual
 
 
@@ -259,11 +260,12 @@ def _slow_focus(family: Family, system: EdgeBalance, belt: Array, guess: Array):
     Its contacts are those of a belt that moves.
     """
 
-    def equations(family, p):
+    def equations(given, p):
+        family, system, belt = given
         osc = family.at(p)
         return jnp.stack([system.balance(osc), velocity_of(osc, belt)])
 
-    found, _, residual, _ = small_newton(equations, family, guess)
+    found, _, residual, _ = small_newton(equations, (family, system, belt), guess)
     return found, residual
 
 

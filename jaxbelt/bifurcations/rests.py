@@ -91,10 +91,12 @@ def _prepared_rest(condition: AbstractRestCondition, osc: Oscillator, guess):
 
 
 def _rest_point(family: Family, system: RestSystem, x0, p0, status, why):
-    def equations(family, u):
+    def equations(given, u):
+        family, system = given
         return system.residual(family.at(u[-1:]), u[:-1])
 
-    u, steps, size, error = small_newton(equations, family, jnp.append(x0, p0), family.unit)
+    given, guess = (family, system), jnp.append(x0, p0)
+    u, steps, size, error = small_newton(equations, given, guess, family.unit)
     x, p = u[:-1], u[-1:]
     exists = system.exists(family.at(p), x)
     judged = jnp.where(exists, Status.OK.value, system.otherwise.value)
@@ -330,12 +332,13 @@ def limit_near(
 def _special_hopf(family: Family, codes, guess: Array, vanishes, *args):
     """(x1, both parameters) of such a Hopf point, and the error."""
 
-    def equations(family, u):
+    def equations(given, u):
+        family, codes, *args = given
         osc = family.at(u[1:])
         also = vanishes(osc, codes, u[0], *args)
         return jnp.append(HopfSystem(codes).residual(osc, u[:1]), also)
 
-    u, _, residual, _ = small_newton(equations, family, guess)
+    u, _, residual, _ = small_newton(equations, (family, codes, *args), guess)
     return u, residual
 
 

@@ -28,7 +28,8 @@ from ..model.modes import capacity, edge_guards, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
 from ..model.variations import Family
 from ..motion.arcs import Ends
-from ..numerics.newton import HOLDS, STEP_ROUNDING, Equations, is_settled, newton, solve
+from ..numerics.implicit import Equations, solution
+from ..numerics.newton import HOLDS, STEP_ROUNDING, is_settled, newton, solve
 from ..numerics.padding import longer
 from ..results import Status
 
@@ -435,31 +436,36 @@ def judged_by(error: Array, family: Family, status: Array) -> Array:
     return jnp.where(fails, Status.DEGENERATE.value, status)
 
 
-def small_newton(equations, osc, unknowns, unit: Any = 1.0):
-    """Newton's method for a few equations(osc, unknowns).
+class _FewEquations(Equations):
+    """function(given, units * u) in the unknowns u."""
+
+    function: Callable = eqx.field(static=True)
+    units: Array
+
+    def residual(self, given, z):
+        return self.function(given, self.units * z)
+
+
+def small_newton(function, given, unknowns, unit: Any = 1.0):
+    """Newton's method for a few equations, function(given, unknowns), differentiable by `given`.
 
     unit: of the last unknown. Returns the solution, its steps, its residual and the error of the
     last unknown.
     """
     units = jnp.ones(unknowns.size).at[-1].set(unit)
-
-    def linearized(u, osc):
-        def still(u):
-            return equations(osc, units * u)
-
-        return still(u), jax.jacfwd(still)(u)
+    equations, still = _FewEquations(function, units), lax.stop_gradient(given)
 
     def determined(u):
-        return _determined(u, *linearized(u, lax.stop_gradient(osc)))
+        return _determined(u, *equations.linearized(still, u))
 
     solved = newton(determined, lax.stop_gradient(unknowns) / units)
-    u = lax.stop_gradient(solved.z)
-    # One more step carries the derivatives with respect to the other parameters.
-    value, matrix = linearized(u, osc)
+    u = solved.z
+    # One more step, for the last digit.
+    value, matrix = equations.linearized(still, u)
     change = jnp.linalg.solve(matrix, value)
     # Towards a multiple root steps shrink by a half or a third only.
-    error = _rounding(u, matrix) + 2 * jnp.abs(lax.stop_gradient(change[-1]))
-    u = u - jnp.where(error < DETERMINED, change, 0.0)
+    error = _rounding(u, matrix) + 2 * jnp.abs(change[-1])
+    u = jnp.where(error < DETERMINED, solution(equations, given, u - change), u)
     return units * u, solved.lengths, jnp.max(jnp.abs(value)), unit * error
 
 

@@ -31,7 +31,8 @@ from ..model.oscillator import Oscillator, at_time, frequencies
 from ..motion.arcs import Ends
 from ..motion.integrators import density
 from ..numerics.compiling import any_lane, jit, power_of_two
-from ..numerics.newton import HOLDS, Equations, Newton, solution, solve
+from ..numerics.implicit import Equations, solution, step_to_root
+from ..numerics.newton import HOLDS, Newton, solve
 from .chains import Chain, Loop, following_codes
 from .shooting import (
     ARC_STEPS,
@@ -476,7 +477,7 @@ def _least(
         y = state(s)
         found = trend_of(osc, mode, function, (y[0], y[1], y[2]))
         bends = (found.curvature > 0) & (h > 0)
-        new = s - found.slope / jnp.where(bends, found.curvature * h, 1.0)
+        new = s + step_to_root(found.slope, found.curvature * h, where=bends)
         # At the end of an arc a coordinate may have a kink, and be extreme for that.
         s = jnp.where(bends & (s > 0) & (s < 1) & (new > 0) & (new < 1), new, s)
     return function(state(s))

@@ -18,7 +18,8 @@ from jaxtyping import Array
 from ..model.modes import select
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import each, jit
-from ..numerics.newton import Equations, solution, solve
+from ..numerics.implicit import Equations, solution
+from ..numerics.newton import solve
 from ..numerics.padding import filled_up, longer
 from .outlines import Outline, Pieces, place_on
 

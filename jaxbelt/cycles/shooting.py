@@ -47,8 +47,10 @@ from ..model.transitions import held_at_boundary, onset_position
 from ..motion.arcs import Ends
 from ..motion.integrators import density
 from ..numerics.compiling import any_lane, lanes_in_one_kernel, one_kernel_alone
+from ..numerics.derivatives import moving_and_fixed
 from ..numerics.extrapolation import Scheme, increments, scheme
-from ..numerics.newton import HOLDS, Equations, moving_and_fixed, solution, solve
+from ..numerics.implicit import Equations, solution
+from ..numerics.newton import HOLDS, solve
 from .chains import Chain, Loop, following_codes
 
 #: Integration steps per slip arc (an arc is about a quarter of a loop at most).
