@@ -59,8 +59,8 @@ class AbstractCycleCondition(AbstractCondition):
         return [one.loop for one in cycles]
 
     def system_at(self, point):
-        chain, z = point.cycle.chain, point.cycle.unknowns
-        loop = Loop(chain.codes, chain.ends, z[:, :2], z[:, 2])
+        chain = point.cycle.chain
+        loop = chain.loop(point.cycle.unknowns)
         ok, data = jnp.asarray(Status.OK.value), self.sought.as_data()
         system, x, _ = _prepared(data, point.oscillator, loop, ok)
         # With the integration steps with which the point was found.

@@ -33,9 +33,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..checks import check_belt, is_concrete
+from ..checks import check_belt, is_concrete, pick
 from ..cycles.attractors import extent
-from ..cycles.chains import SIZES, Chain, Loop, cut
+from ..cycles.chains import SIZES, Chain, Loop, cut, first_failure
 from ..cycles.cycle import cycle_of
 from ..cycles.orbits import Orbit, follow_from, place_of_rest
 from ..cycles.separatrices import mode_onward
@@ -256,8 +256,7 @@ def _with_mesh(osc: Oscillator, loop: Loop, leaves: Array, arrives: Array, statu
 def _solved_connection(family: Family, system: Connection, z0, p0, status):
     solution = solve_system(family, system, z0, p0, status)
     osc, z, status = family.at(solution.p), solution.z, solution.status
-    fails = (status == Status.OK) & ~system.exists(osc, z)
-    status = jnp.where(fails, Status.NOT_ADMISSIBLE.value, status)
+    status = first_failure(status, system.exists(osc, z), Status.NOT_ADMISSIBLE)
     closes = jnp.where(system.closes(osc), status, Status.EQUILIBRIUM.value)
     cycle, _ = cycle_of(osc, system.chain, z, solution.iterations, closes, solution.residual)
     return point_of(family, solution, cycle, jnp.asarray(jnp.nan), status), (z, solution.p)
@@ -297,12 +296,6 @@ def _departing(osc: Oscillator, edge: Array, rightward: Array, parts: Array, bud
     return follow_from(osc, mode_onward(osc, x1, rightward), y, status, budget)
 
 
-def _exits(orbit: Orbit) -> Array:
-    """States at the ends of the arcs of an orbit, [arcs, 2]."""
-    last = jnp.arange(orbit.ends.size) == orbit.count - 1
-    return jnp.where(last[:, None], orbit.y, jnp.roll(orbit.entries, -1, axis=0))
-
-
 def _turns_back(osc: Oscillator, orbit: Orbit) -> Array:
     """Whether each arc ends in an extremum of x1, [arcs]; the boundary of a belt at rest is one."""
     n, velocities = len(osc.belts), jnp.stack([belt.velocity for belt in osc.belts])
@@ -328,7 +321,7 @@ def _nearest_connection(osc: Oscillator, belt: Array, to: Array, size: int):
     def one(start):
         edge, rightward = start
         orbit = _departing(osc, edge, rightward, parts[edge], size - 1)
-        exits = _exits(orbit)
+        exits = orbit.exits
         turns = jnp.where(_turns_back(osc, orbit), 0.0, jnp.inf)
         turned = jnp.abs(exits[:, :1] - positions[None]) + turns[:, None]
         # Distance that an orbit which passes a saddle would have gone farther in its mode.
@@ -359,7 +352,7 @@ def _nearest_connection(osc: Oscillator, belt: Array, to: Array, size: int):
     distances, loops, arrives = each(one)(starts)
     best = jnp.argmin(distances)
     status = jnp.where(jnp.isfinite(distances[best]), Status.OK.value, Status.NOT_TOUCHED.value)
-    loop = jax.tree.map(lambda leaf: leaf[best], loops)
+    loop = pick(loops, best)
     return loop, numbers[starts[0][best]], arrives[best], status
 
 
@@ -400,7 +393,7 @@ def _courses_of(oscs: Oscillator) -> _Courses:
         def one(start):
             edge, rightward = start
             orbit = _departing(osc, edge, rightward, parts[edge], ARCS)
-            extrema = jnp.where(_turns_back(osc, orbit), _exits(orbit)[:, 0], jnp.nan)
+            extrema = jnp.where(_turns_back(osc, orbit), orbit.exits[:, 0], jnp.nan)
             return extrema, orbit.repeats, place_of_rest(osc, orbit)
 
         starts = jnp.repeat(jnp.arange(2 * n), 2), jnp.tile(jnp.array([False, True]), 2 * n)

@@ -29,7 +29,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..checks import as_array, check_finite, is_concrete, require
-from ..cycles.chains import Loop
+from ..cycles.chains import Loop, first_failure
 from ..cycles.clocked import (
     TimedChain,
     guards_along,
@@ -62,15 +62,7 @@ from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from ..results import Status
 from .base import AbstractCondition, BifurcationPoint, Line, point_of
-from .systems import (
-    EXACT_ARC,
-    PARTS_OF_ARC,
-    WEIGHT,
-    AbstractSystem,
-    Seen,
-    on_both_meshes,
-    solve_system,
-)
+from .systems import PARTS_OF_ARC, AbstractChainSystem, Seen, solve_system
 
 #: Places of a motion from which a condition is tried, the most promising ones first.
 TRIED = 3
@@ -95,9 +87,8 @@ STARTS_OF_MOTIONS = (
 # --- systems --------------------------------------------------------------------------------------
 
 
-class TimedSystem(AbstractSystem):
-    """A periodic motion of a fixed signature and a condition; the unknowns are those of the motion,
-    [N, 4]."""
+class TimedSystem(AbstractChainSystem):
+    """A condition on a periodic motion; the unknowns are those of the motion, [N, 4]."""
 
     chain: eqx.AbstractVar[TimedChain]
 
@@ -137,29 +128,15 @@ class TimedSystem(AbstractSystem):
         numbers = jnp.zeros(()), jnp.asarray(0), jnp.asarray(Status.OK.value)
         return place_of_motion(PeriodicMotion(osc, self.chain, jnp.asarray(x), none, *numbers))
 
-    def shaped(self, x):
-        return x.reshape(-1, 4)
-
-    def weights(self, x):
-        return WEIGHT / (1 + jnp.abs(x.reshape(-1)))
-
     def remeshed(self, osc, x):
-        loop = Loop(self.chain.codes, self.chain.ends, x[:, :3], x[:, 3])
         # The mesh has been refined, and will be once more.
         size = self.chain.mesh.shape[-1] // PARTS_OF_ARC
-        chain, _ = timed_chain(osc, loop, size, self.chain.turns)
+        chain, _ = timed_chain(osc, self.chain.loop(x), size, self.chain.turns)
         return eqx.tree_at(lambda system: system.chain, self, chain).refined(osc, x)
 
-    def refined(self, osc: Oscillator, x: Array) -> "TimedSystem":
-        """The same with shorter integration steps on arcs that need them, as `CycleSystem` has."""
-        values = on_both_meshes(self, lambda one: timed_residual(osc, one.chain, x))
-        error = jnp.max(jnp.abs(values[0] - values[1]), axis=-1)
-        mesh = self.chain.mesh
-        fine = jnp.repeat(mesh / PARTS_OF_ARC, PARTS_OF_ARC, axis=-1)
-        coarse = jnp.pad(mesh, [(0, 0), (0, (PARTS_OF_ARC - 1) * mesh.shape[-1])])
-        is_exact = error < EXACT_ARC * (1 + jnp.max(jnp.abs(x[:, :2])))
-        mesh = jnp.where(is_exact[:, None], coarse, fine)
-        return eqx.tree_at(lambda system: system.chain.mesh, self, lax.stop_gradient(mesh))
+    def error_of_steps(self, osc, x):
+        values = self.chain.on_both_meshes(lambda chain: timed_residual(osc, chain, x))
+        return jnp.max(jnp.abs(values[0] - values[1]), axis=-1)
 
 
 class OnUnitCircle(TimedSystem):
@@ -194,8 +171,7 @@ class OnUnitCircle(TimedSystem):
         is_there = jnp.min(jnp.abs(found - wanted.astype(complex))) < ON_CIRCLE
         is_pair = jnp.abs(jnp.imag(found[0])) > ON_CIRCLE
         fits = jnp.where(self.parts[1] == 0, is_pair, is_there)
-        other = (motion.status == Status.OK) & ~fits
-        return jnp.where(other, Status.OTHER_KIND.value, motion.status)
+        return first_failure(motion.status, fits, Status.OTHER_KIND)
 
 
 class Touching(TimedSystem):
@@ -237,8 +213,7 @@ class AtLimit(TimedSystem):
         limits = trend_of(osc, mode, guards, (y[0], y[1], y[2])).slope[-2:]
         values = guards((y[0], y[1], y[2]))[-2:]
         rises = -jnp.where(values[0] < values[1], limits[0], limits[1])
-        other = (motion.status == Status.OK) & ~(self.rises * rises >= 0)
-        return jnp.where(other, Status.OTHER_KIND.value, motion.status)
+        return first_failure(motion.status, self.rises * rises >= 0, Status.OTHER_KIND)
 
 
 # --- what conditions have in common ---------------------------------------------------------------

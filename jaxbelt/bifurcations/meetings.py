@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..checks import is_concrete, require_value
-from ..cycles.chains import SIZES, Chain, Loop
+from ..checks import is_concrete, pick, require_value
+from ..cycles.chains import SIZES, Chain, Loop, after_each
 from ..cycles.shooting import meshed
 from ..model.modes import Mode, any_of, capacity, edges, mode_acceleration
 from ..model.oscillator import Oscillator
@@ -142,9 +142,8 @@ def _passage_of_edges(osc: Oscillator, loop: Loop, belts) -> tuple[Array, Array,
     """
     n, positions, pairs = len(osc.belts), jnp.stack(edges(osc)), _edge_pairs(osc, belts)
     passes = (loop.ends >= n) & (loop.ends < 3 * n)
-    last = jnp.arange(loop.ends.size) == jnp.sum(loop.used) - 1
     at = jnp.where(passes, positions[jnp.clip(loop.ends - n, 0, 2 * n - 1)], jnp.nan)
-    following = jnp.where(last, at[0], jnp.roll(at, -1))
+    following = after_each(loop, at)
 
     def distances(pair):
         first, second = positions[pair.first], positions[pair.second]
@@ -155,7 +154,7 @@ def _passage_of_edges(osc: Oscillator, loop: Loop, belts) -> tuple[Array, Array,
 
     found = jax.vmap(distances)(pairs)
     which, row = jnp.divmod(jnp.argmin(found), loop.ends.size)
-    return found[which, row], row, jax.tree.map(lambda leaf: leaf[which], pairs)
+    return found[which, row], row, pick(pairs, which)
 
 
 # --- the mass rests there -------------------------------------------------------------------------
@@ -224,7 +223,7 @@ class MeetingEdges(AbstractRestCondition, _BetweenEdges):
         pairs = _edge_pairs(osc, self.belts)
         sizes = _size(jax.vmap(lambda pair: pair.gap(osc))(pairs))
         at = jnp.argmin(sizes)
-        pair = jax.tree.map(lambda leaf: leaf[at], pairs)
+        pair = pick(pairs, at)
         status = jnp.where(jnp.isfinite(sizes[at]), Status.OK.value, Status.NOT_TOUCHED.value)
         return EdgesAtRest(pair, self.belts), NOTHING, status
 

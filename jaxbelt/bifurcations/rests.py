@@ -25,6 +25,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
+from ..checks import pick
 from ..cycles.orbits import Orbit
 from ..cycles.shooting import trace_of
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates, edge_rounding
@@ -147,7 +148,7 @@ class AbstractRestOfSeveral(AbstractRestCondition):
 
 @jit
 def _of_row(tree: Any, row: Array) -> Any:
-    return jax.tree.map(lambda leaf: leaf[row], tree)
+    return pick(tree, row)
 
 
 @jit
@@ -181,7 +182,7 @@ def _solved_nearest(family: Family, systems: RestSystem, x0, p0, status, why):
     """
 
     def at_row(family, row):
-        system, x, said = jax.tree.map(lambda leaf: leaf[row], (systems, x0, status))
+        system, x, said = pick((systems, x0, status), row)
         return _rest_point(family, system, x, p0, said, why)
 
     # The choice has no derivative; nor would the point have one beside rows of NaN.

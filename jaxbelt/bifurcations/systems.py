@@ -11,7 +11,7 @@ import abc
 import functools
 from collections.abc import Callable
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import equinox as eqx
 import jax
@@ -21,7 +21,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..cycles.attractors import extent
-from ..cycles.chains import Chain, Loop, following_codes
+from ..cycles.chains import Chain, after_each, first_failure, following_codes
 from ..cycles.cycle import Cycle, cycle_of
 from ..cycles.shooting import jacobian, meshed, residual, residual_and_blocks
 from ..model.modes import capacity, edge_guards, mode_acceleration, mode_of
@@ -160,7 +160,36 @@ class RestSystem(AbstractSystem):
         return self
 
 
-# --- systems of a cycle ---------------------------------------------------------------------------
+# --- systems of a closed chain of arcs ------------------------------------------------------------
+
+
+class AbstractChainSystem(AbstractSystem):
+    """A fixed signature and a condition; the unknowns are those of the arcs, [N, 3] or [N, 4]."""
+
+    chain: eqx.AbstractVar[Chain]
+
+    @abc.abstractmethod
+    def error_of_steps(self, osc: Oscillator, x: Array) -> Array:
+        """The error of the integration steps in the equations of each arc at x, [N]."""
+
+    def shaped(self, x):
+        return x.reshape(self.chain.ends.size, -1)
+
+    def weights(self, x):
+        return WEIGHT / (1 + jnp.abs(x.reshape(-1)))
+
+    def refined(self, osc: Oscillator, x: Array) -> Self:
+        """The same system with shorter integration steps on arcs that need them.
+
+        The error of the steps in the equations at x decides; steps of length zero pad the other
+        arcs.
+        """
+        mesh = self.chain.mesh
+        fine = jnp.repeat(mesh / PARTS_OF_ARC, PARTS_OF_ARC, axis=-1)
+        coarse = longer(mesh, fine.shape[-1], axis=-1, fill=0.0)
+        is_exact = self.error_of_steps(osc, x) < EXACT_ARC * (1 + jnp.max(jnp.abs(x[:, :2])))
+        mesh = jnp.where(is_exact[:, None], coarse, fine)
+        return eqx.tree_at(lambda system: system.chain.mesh, self, lax.stop_gradient(mesh))
 
 
 def third_derivative(osc: Oscillator, codes: Array, x1: Array) -> Array:
@@ -175,10 +204,8 @@ def third_derivative(osc: Oscillator, codes: Array, x1: Array) -> Array:
     return derivative(derivative(derivative(acceleration)))(jnp.zeros(()))
 
 
-class CycleSystem(AbstractSystem):
-    """A fixed signature and a condition; the unknowns are those of the cycle, [N, 3]."""
-
-    chain: eqx.AbstractVar[Chain]
+class CycleSystem(AbstractChainSystem):
+    """A condition on a cycle; the unknowns are those of the cycle, [N, 3]."""
 
     @abc.abstractmethod
     def condition(self, osc: Oscillator, z: Array, miss: Array) -> Array:
@@ -237,33 +264,15 @@ class CycleSystem(AbstractSystem):
     def place(self, osc, x):
         return extent(x[np.asarray(self.chain.used)])
 
-    def shaped(self, x):
-        return x.reshape(-1, 3)
-
-    def weights(self, x):
-        return WEIGHT / (1 + jnp.abs(x.reshape(-1)))
-
     def remeshed(self, osc, x):
-        loop = Loop(self.chain.codes, self.chain.ends, x[:, :2], x[:, 2])
-        return eqx.tree_at(lambda system: system.chain, self, meshed(osc, loop)[0]).refined(osc, x)
+        chain, _ = meshed(osc, self.chain.loop(x))
+        return eqx.tree_at(lambda system: system.chain, self, chain).refined(osc, x)
 
-    def refined(self, osc: Oscillator, x: Array) -> "CycleSystem":
-        """The same system with shorter integration steps on arcs that need them.
-
-        The error of the steps in the equations at x decides; steps of length zero pad the other
-        arcs.
-        """
-        chain = self.chain
-        values, misses = on_both_meshes(self, lambda one: residual(osc, one.chain, x))
+    def error_of_steps(self, osc, x):
+        values, misses = self.chain.on_both_meshes(lambda chain: residual(osc, chain, x))
         error = jnp.max(jnp.abs(values[0] - values[1]), axis=-1)
-        is_tangent = chain.ends >= Ends(chain.codes.shape[-1]).tangent
-        error = jnp.where(is_tangent, jnp.maximum(error, jnp.abs(misses[0] - misses[1])), error)
-        mesh = chain.mesh
-        fine = jnp.repeat(mesh / PARTS_OF_ARC, PARTS_OF_ARC, axis=-1)
-        coarse = longer(mesh, fine.shape[-1], axis=-1, fill=0.0)
-        is_exact = error < EXACT_ARC * (1 + jnp.max(jnp.abs(x[:, :2])))
-        mesh = jnp.where(is_exact[:, None], coarse, fine)
-        return eqx.tree_at(lambda system: system.chain.mesh, self, lax.stop_gradient(mesh))
+        is_tangent = self.chain.ends >= Ends(self.chain.codes.shape[-1]).tangent
+        return jnp.where(is_tangent, jnp.maximum(error, jnp.abs(misses[0] - misses[1])), error)
 
 
 def stick_phase_from(osc: Oscillator, chain: Chain, row: Array) -> Array:
@@ -290,9 +299,7 @@ def nearest_contacts(
     exists. without: belts that are ignored where arcs pass an edge, [arcs, belts].
     """
     n, without = len(osc.belts), jnp.broadcast_to(without, chain.codes.shape)
-    following = jnp.roll(z, -1, axis=0)
-    last = jnp.arange(chain.ends.size) == jnp.sum(chain.used) - 1
-    following = jnp.where(last[:, None], z[0], following)
+    following = after_each(chain, z)
     extrema = chain.used & (chain.ends == Ends(n).extremum_x2)
     passes = (chain.ends >= n) & (chain.ends < 3 * n)
     # Beyond a point to which the cycle shrinks the equations go on, on the other side of the edge.
@@ -336,9 +343,7 @@ def nearest_edge(osc: Oscillator, chain: Chain, z: Array, without: bool | Array 
     """
     n = chain.codes.shape[-1]
     kinds = Ends(n)
-    following = jnp.roll(z, -1, axis=0)
-    last = jnp.arange(chain.ends.size) == jnp.sum(chain.used) - 1
-    following = jnp.where(last[:, None], z[0], following)
+    following = after_each(chain, z)
 
     def distance(codes, end, after, y):
         gap = jnp.min(jnp.stack(edge_guards(osc, mode_of(codes), y[0])))
@@ -410,21 +415,15 @@ def _accuracy(osc: Oscillator, system: Any, z: Array, matrix: Array):
 
     The bound is the effect of the residual with halved steps, and of rounding.
     """
-    values = on_both_meshes(system, lambda one: one.residual(osc, z))
+
+    def value(chain):
+        return eqx.tree_at(lambda s: s.chain, system, chain).residual(osc, z)
+
+    values = system.chain.on_both_meshes(value)
     weights = jnp.linalg.solve(matrix.T, jnp.zeros(values.shape[1]).at[-1].set(1.0))
     # Rounding of states; for durations, however long, the velocity cancels it.
     rounding = 1e-15 * (1 + jnp.max(jnp.abs(z[:, :2]))) * jnp.sum(jnp.abs(weights))
     return jnp.max(jnp.abs(values[0])), 2 * jnp.abs(jnp.sum(weights * values[1])) + rounding
-
-
-def on_both_meshes(system: Any, value: Callable[[Any], Any]) -> Any:
-    """A value of the system with its integration steps as they are, and with all of them halved."""
-    mesh = system.chain.mesh
-    # Padded by steps of length zero to one shape.
-    meshes = jnp.stack(
-        [jnp.concatenate([mesh, jnp.zeros_like(mesh)], axis=1), jnp.repeat(0.5 * mesh, 2, axis=1)]
-    )
-    return lax.map(lambda m: value(eqx.tree_at(lambda s: s.chain.mesh, system, m)), meshes)
 
 
 def judged_by(error: Array, family: Family, status: Array) -> Array:
@@ -432,8 +431,7 @@ def judged_by(error: Array, family: Family, status: Array) -> Array:
 
     DEGENERATE in place of OK where the equations hold and do not determine the parameter.
     """
-    fails = (status == Status.OK) & ~(error < DETERMINED * family.unit)
-    return jnp.where(fails, Status.DEGENERATE.value, status)
+    return first_failure(status, error < DETERMINED * family.unit, Status.DEGENERATE)
 
 
 class _FewEquations(Equations):

@@ -23,10 +23,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..cycles.chains import SIZES, Chain, Loop
+from ..cycles.chains import SIZES, Chain, Loop, first_failure
 from ..cycles.orbits import Orbit, follow, last_loop, loop_of
 from ..cycles.shooting import admissible, meshed, trace_of
-from ..model.modes import STUCK, mode_acceleration, mode_of
+from ..model.modes import STUCK, mode_acceleration, mode_of, select
 from ..model.oscillator import Oscillator
 from ..model.variations import Family
 from ..motion.arcs import Ends
@@ -88,8 +88,7 @@ class Encounter(CycleSystem):
         # the slope may be infinite
         is_wanted = (self.wanted == 0) | (self.wanted * (slope - 1) >= 0)
         fits = ~self.is_tangency | is_wanted
-        other_kind = (cycle.status == Status.OK) & ~fits
-        status = jnp.where(other_kind, Status.OTHER_KIND.value, cycle.status)
+        status = first_failure(cycle.status, fits, Status.OTHER_KIND)
         return status, jnp.where(self.is_tangency, slope, jnp.nan)
 
     def watch(self, osc, z, slope):
@@ -246,7 +245,7 @@ def _nearly_closed(osc: Oscillator, orbit: Orbit, belt: Array, size: int) -> tup
     n = len(osc.belts)
     velocity = velocity_of(osc, belt)
     repeated = orbit.status == Status.OK
-    exits = jnp.roll(orbit.entries, -1, axis=0).at[orbit.count - 1].set(orbit.y)
+    exits = orbit.exits
     rows = jnp.arange(HINT_BUDGET)
     near = (orbit.ends == Ends(n).extremum_x2) & (exits[:, 1] * jnp.sign(velocity) > 0) & (rows > 0)
     last = jnp.argmax(near)
@@ -257,11 +256,10 @@ def _nearly_closed(osc: Oscillator, orbit: Orbit, belt: Array, size: int) -> tup
     returns = jnp.any(near) & ~jnp.any(
         (rows > 0) & (rows <= last) & jnp.any(orbit.codes == 0, axis=-1)
     )
-    orbit = jax.tree.map(lambda a, b: jnp.where(repeated, a, b), orbit, first_loop)
+    orbit = select(repeated, orbit, first_loop)
     _, count = last_loop(orbit)
     status = jnp.where(repeated | returns, Status.OK.value, Status.NOT_TOUCHED.value)
-    fits = (status != Status.OK) | (count <= size)
-    return loop_of(orbit, size, n), jnp.where(fits, status, Status.TOO_MANY_ARCS.value)
+    return loop_of(orbit, size, n), first_failure(status, count <= size, Status.TOO_MANY_ARCS)
 
 
 def _with_stick(osc: Oscillator, loop: Loop, belt: int | Array) -> tuple[Loop, Array, Array]:
@@ -296,7 +294,7 @@ def _with_stick(osc: Oscillator, loop: Loop, belt: int | Array) -> tuple[Loop, A
         entries=inserted(loop.entries, jnp.stack([following[at, 0], velocity / osc.omega])),
         durations=inserted(loop.durations, jnp.zeros(())),
     )
-    loop = jax.tree.map(lambda a, b: jnp.where(has_own, a, b), loop, new)
+    loop = select(has_own, loop, new)
     return loop, jnp.where(has_own, own, at + 1), has_own | jnp.any(loops)
 
 
@@ -315,7 +313,7 @@ def _tangent_departure(family: Family, codes, resting, touched, guess: Array):
     start = _departure(osc, codes, resting)
     orbit = follow(osc, start, HINT_BUDGET)
     names = Ends(len(osc.belts))
-    exits = jnp.roll(orbit.entries, -1, axis=0).at[orbit.count - 1].set(orbit.y)
+    exits = orbit.exits
     side = jnp.sign(jnp.stack([belt.velocity for belt in osc.belts])[touched])
     loops = (orbit.ends == names.extremum_x2) & (exits[:, 1] * side > 0)
     meets = (loops | (orbit.ends == touched)) & (jnp.arange(HINT_BUDGET) < orbit.count)

@@ -38,7 +38,7 @@ from ..numerics.newton import HOLDS
 from ..numerics.padding import longer
 from ..results import Status, describe, draw
 from ..tables import per_belt, require_single, table_of
-from .chains import SIZES, Chain, Loop, loop_events, modes_of, room_of
+from .chains import SIZES, Chain, Loop, first_failure, loop_events, modes_of, room_of
 from .orbits import MOST_ARCS, follow, last_loop, loop_of
 from .periodic import motion_reached
 from .shooting import (
@@ -279,14 +279,14 @@ def cycle_of(
     """
     residual, slope = closure(osc, chain, z)
     if error is None:
-        status = _first_failure(status, residual < HOLDS, Status.NO_CONVERGENCE)
+        status = first_failure(status, residual < HOLDS, Status.NO_CONVERGENCE)
     else:
         residual = error
-    status = _first_failure(status, admissible(osc, chain, z), Status.NOT_ADMISSIBLE)
+    status = first_failure(status, admissible(osc, chain, z), Status.NOT_ADMISSIBLE)
     sticks = jnp.any(chain.used[:, None] & (chain.codes == 0))
     # An equilibrium solves the equations, too, with arcs of any duration.
     moves = sticks | (jnp.max(z[:, 1]) - jnp.min(z[:, 1]) > HOLDS)
-    status = _first_failure(status, moves, Status.NO_CONVERGENCE)
+    status = first_failure(status, moves, Status.NO_CONVERGENCE)
     known = functools.partial(jnp.where, status == Status.OK)
     cycle = Cycle(
         oscillator=osc,
@@ -299,10 +299,6 @@ def cycle_of(
         status=status,
     )
     return cycle, slope
-
-
-def _first_failure(status: Array, fine: Array, code: Status) -> Array:
-    return jnp.where((status == Status.OK) & ~fine, code.value, status)
 
 
 @jit
@@ -323,7 +319,7 @@ def _loop_reached_by_lane(osc: Oscillator, y0: Array, size: int):
     orbit = eqx.tree_at(lambda orbit: (orbit.repeats, orbit.count), orbit, loop)
     _, count = last_loop(orbit)
     loop = loop_of(orbit, size, len(osc.belts))
-    status = _first_failure(orbit.status, ~_loop_is_neutral(osc, loop), Status.NEUTRAL)
+    status = first_failure(orbit.status, ~_loop_is_neutral(osc, loop), Status.NEUTRAL)
     return loop, count, _if_it_fits(status, count, size), orbit.y
 
 
@@ -336,7 +332,7 @@ def _loop_is_neutral(osc: Oscillator, loop: Loop) -> Array:
 
 
 def _if_it_fits(status: Array, count: Array, size: int) -> Array:
-    return _first_failure(status, count <= size, Status.TOO_MANY_ARCS)
+    return first_failure(status, count <= size, Status.TOO_MANY_ARCS)
 
 
 def exactly(osc: Oscillator, loop: Loop, status: Array) -> Cycle:
@@ -475,7 +471,7 @@ def _polished(osc: Oscillator, loop: Loop, status: Array, steps: int) -> tuple[C
     error, _ = closure(*lax.stop_gradient((osc, chain.halved, z)))
     # Near a fixed point that hardly attracts or repels all small loops nearly close.
     is_known = off < DISTINCT * jnp.max(jnp.ptp(z[:, :2], axis=0))
-    status = _first_failure(status, (error < HOLDS) & is_known, Status.NO_CONVERGENCE)
+    status = first_failure(status, (error < HOLDS) & is_known, Status.NO_CONVERGENCE)
     return cycle_of(osc, chain, z, iterations, status)[0], error
 
 

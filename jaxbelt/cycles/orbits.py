@@ -73,6 +73,12 @@ class Orbit(eqx.Module):
     status: Array
     done: Array
 
+    @property
+    def exits(self) -> Array:
+        """States at the ends of the arcs, [arcs, 2]."""
+        last = jnp.arange(self.ends.size) == self.count - 1
+        return jnp.where(last[:, None], self.y, jnp.roll(self.entries, -1, axis=0))
+
 
 def _arc(osc: Oscillator, orbit: Orbit, stride: float | Array, reach: float | Array) -> ArcEnd:
     """The next arc of an orbit, to an extremum at most."""

@@ -7,7 +7,6 @@ which `clocked` solves for the motion that repeats after them.
 import functools
 import itertools
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
@@ -37,7 +36,7 @@ from ..numerics.compiling import jit, power_of_two
 from ..numerics.newton import HOLDS
 from ..results import Status, describe, draw
 from ..tables import per_belt, require_single, table_of
-from .chains import SIZES, Loop, loop_events
+from .chains import SIZES, Loop, first_failure, loop_events
 from .clocked import (
     TimedChain,
     extrema_along,
@@ -402,11 +401,7 @@ def _polished_motion(
     solved = solve_timed(osc, chain, guess)
     z, settled = solved.z, solved.unsettled
     still, at = lax.stop_gradient((osc, z))
-    mesh = chain.mesh
-    # Padded by steps of length zero to one shape.
-    halved = jnp.repeat(0.5 * mesh, 2, axis=1)
-    meshes = jnp.stack([jnp.concatenate([mesh, jnp.zeros_like(mesh)], axis=1), halved])
-    values = lax.map(lambda m: timed_residual(still, replace(chain, mesh=m), at), meshes)
+    values = chain.on_both_meshes(lambda one: timed_residual(still, one, at))
     error = jnp.max(jnp.abs(values[0] - values[1]))
     residual = jnp.max(jnp.abs(values[0]))
     fine = (residual < HOLDS) & (settled < HOLDS) & (error <= most)
@@ -420,8 +415,7 @@ def _polished_motion(
 def motion_at(osc, chain, z, residual, iterations, status) -> PeriodicMotion:
     """The motion with the unknowns z, NaN with a status where it is none."""
     inside = timed_admissible(*lax.stop_gradient((osc, chain, z)))
-    fails = (status == Status.OK) & ~inside
-    status = jnp.where(fails, Status.NOT_ADMISSIBLE.value, status)
+    status = first_failure(status, inside, Status.NOT_ADMISSIBLE)
     return _motion(osc, chain, z, residual, iterations, status)
 
 
@@ -451,7 +445,7 @@ def solved_from(osc: Oscillator, loop: Loop, turns: int) -> PeriodicMotion:
         converged = int(motion.status) in (Status.OK, Status.NOT_ADMISSIBLE)
         if not converged or float(error) < EXACT_MOTION:
             break
-        chain = replace(chain, mesh=jnp.repeat(0.5 * chain.mesh, 2, axis=1))
+        chain = chain.halved
         finer, remaining = _polished_motion(osc, chain, guess)
         if float(remaining) > 0.1 * float(error):
             break  # the rest is rounding
@@ -466,7 +460,7 @@ def motion_at_unknowns(osc: Oscillator, chain: TimedChain, z: Array) -> Periodic
     converged = int(motion.status) in (Status.OK, Status.NOT_ADMISSIBLE)
     if not converged or float(error) < EXACT_MOTION:
         return motion
-    return solved_from(osc, Loop(chain.codes, chain.ends, z[:, :3], z[:, 3]), chain.turns)
+    return solved_from(osc, chain.loop(z), chain.turns)
 
 
 def nothing_found(osc: Oscillator, turns: int, status: int) -> PeriodicMotion:

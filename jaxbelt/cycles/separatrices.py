@@ -392,13 +392,11 @@ def _orbit_from(osc: Oscillator, y: Array, codes: Array, reach: Array, budget: i
     rest = place_of_rest(osc, orbit)
     used = jnp.arange(budget) < orbit.count
     durations = jnp.where(used & jnp.isfinite(orbit.durations), orbit.durations, 0.0)
-    last = (jnp.arange(budget) == orbit.count - 1)[:, None]
-    exits = jnp.where(last, orbit.y, jnp.roll(orbit.entries, -1, axis=0))
 
     def samples(codes, entry, exit_, duration):
         return arc_samples(osc, codes, entry, exit_, duration, ARC_SAMPLES)
 
-    return orbit, rest, *each(samples)(orbit.codes, orbit.entries, exits, durations)
+    return orbit, rest, *each(samples)(orbit.codes, orbit.entries, orbit.exits, durations)
 
 
 @jit

@@ -51,7 +51,7 @@ from ..numerics.derivatives import moving_and_fixed
 from ..numerics.extrapolation import Scheme, increments, scheme
 from ..numerics.implicit import Equations, solution
 from ..numerics.newton import HOLDS, solve
-from .chains import Chain, Loop, following_codes
+from .chains import Chain, Loop, after_each, following_codes
 
 #: Integration steps per slip arc (an arc is about a quarter of a loop at most).
 ARC_STEPS = 8
@@ -669,8 +669,7 @@ def admissible(osc: Oscillator, chain: Chain, z: Array) -> Array:
         return fine & ~(any_of(hit) & ~following.any_stuck & would_stick)
 
     velocities = jnp.stack([belt.velocity for belt in osc.belts])
-    exits, durations = jnp.roll(z[:, :2], -1, axis=0), jnp.roll(z[:, 2], -1)
-    last = jnp.arange(chain.ends.size) == jnp.sum(chain.used) - 1
-    lasts = jnp.where(last, z[0, 2], durations) > LASTS
+    exits = jnp.roll(z[:, :2], -1, axis=0)
+    lasts = after_each(chain, z[:, 2]) > LASTS
     each = jax.vmap(one)(chain.codes, chain.ends, z, exits, following_codes(chain), lasts)
     return jnp.all(each | ~chain.used)
