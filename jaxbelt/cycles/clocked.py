@@ -45,7 +45,7 @@ from .shooting import (
     flow,
     jacobian,
     slip_slopes,
-    weighted,
+    with_columns,
 )
 
 #: A step times the density of steps that is wanted there: of order twelve, so that what a step
@@ -168,25 +168,11 @@ def _timed_arc_equations(turns: int, osc: Oscillator, codes, end, mesh, unknown:
 
 def _and_columns(turns: int, osc, along, codes, end, mesh, unknown: Array):
     """`_timed_arc_equations` and their derivatives, by the unknowns and along, [4, 4 + k]."""
-    return _timed_columns(
-        functools.partial(_timed_arc_equations, turns), osc, along, codes, end, mesh, unknown
-    )
 
+    def equations(osc, u):
+        return _timed_arc_equations(turns, osc, codes, end, mesh, u)
 
-def _timed_columns(function: Callable, osc: Oscillator, along: Oscillator | None, *row: Array):
-    """A function of an oscillator and the row of an arc, and its derivatives by the unknowns, the
-    last of the row, and along directions, in a last axis of 4 + k."""
-    *given, unknown = row
-    more = 0 if along is None else jax.tree.leaves(along)[0].size
-
-    def column(direction):
-        if along is None:
-            return jax.jvp(lambda u: function(osc, *given, u), (unknown,), (direction,))
-        moved = jax.tree.map(functools.partial(weighted, direction[4:]), along)
-        tangents = moved, direction[:4]
-        return jax.jvp(lambda o, u: function(o, *given, u), (osc, unknown), tangents)
-
-    return jax.vmap(column, out_axes=(None, -1))(jnp.eye(4 + more))
+    return with_columns(equations, osc, along, unknown)
 
 
 def _by_turns(function: Callable) -> Callable[[int], Callable]:
@@ -266,9 +252,13 @@ _arc_maps = _by_turns(_arc_map)
 
 
 @_by_turns
-def _maps_and_slopes(turns, osc, along, *row):
+def _maps_and_slopes(turns, osc, along, codes, end, mesh, unknown: Array):
     """`_arc_map` and its derivatives by the unknowns and along directions, [3, 3, 4 + k]."""
-    return _timed_columns(functools.partial(_arc_map, turns), osc, along, *row)
+
+    def arc_map(osc, u):
+        return _arc_map(turns, osc, codes, end, mesh, u)
+
+    return with_columns(arc_map, osc, along, unknown)
 
 
 def arc_maps(osc: Oscillator, chain: TimedChain, z: Array) -> Array:

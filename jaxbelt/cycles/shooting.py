@@ -345,22 +345,36 @@ def _equations_and_blocks(
     osc: Oscillator, along: Oscillator | None, codes, end, mesh, backwards, unknown: Array
 ):
     """`_arc_equations`, [4], and their derivatives, [4, 3 + k]."""
-    more = 0 if along is None else jax.tree.leaves(along)[0].size
 
     def equations(osc, u):
         return _arc_equations(osc, codes, end, mesh, backwards, u)
 
+    return with_columns(equations, osc, along, unknown)
+
+
+def with_columns(
+    function: Callable[[Oscillator, Array], Array],
+    osc: Oscillator,
+    along: Oscillator | None,
+    unknowns: Array,
+) -> tuple[Array, Array]:
+    """A function of an oscillator and n unknowns, and its derivatives, in a last axis of n + k.
+
+    By the unknowns, and along the k directions `along` in the space of oscillators (an oscillator
+    of arrays [k, ..]; None: none).
+    """
+    n, more = unknowns.size, 0 if along is None else jax.tree.leaves(along)[0].size
+
     def column(direction):
         if along is None:
-            of_unknown = functools.partial(equations, osc)
-            return jax.jvp(of_unknown, (unknown,), (direction,))
-        moved = jax.tree.map(functools.partial(weighted, direction[3:]), along)
-        return jax.jvp(equations, (osc, unknown), (moved, direction[:3]))
+            return jax.jvp(functools.partial(function, osc), (unknowns,), (direction,))
+        moved = jax.tree.map(functools.partial(_weighted, direction[n:]), along)
+        return jax.jvp(function, (osc, unknowns), (moved, direction[:n]))
 
-    return jax.vmap(column, out_axes=(None, -1))(jnp.eye(3 + more))
+    return jax.vmap(column, out_axes=(None, -1))(jnp.eye(n + more))
 
 
-def weighted(weights: Array, slopes: Array) -> Array:
+def _weighted(weights: Array, slopes: Array) -> Array:
     """The sum of the slopes, [k, ..], each times its weight."""
     return jnp.sum(weights.reshape(-1, *[1] * (slopes.ndim - 1)) * slopes, axis=0)
 
@@ -624,17 +638,11 @@ def _factors_and_slopes(
 ):
     """The factor of an arc and its derivatives, [5 + k]: by its unknowns, the next entry, the
     directions."""
-    more = jax.tree.leaves(along)[0].size
 
-    def factor(osc, unknown, entry):
-        return _error_and_factor(osc, codes, end, mesh, following, unknown, entry)[1]
+    def factor(osc, both):
+        return _error_and_factor(osc, codes, end, mesh, following, both[:3], both[3:])[1]
 
-    def column(direction):
-        moved = jax.tree.map(functools.partial(weighted, direction[5:]), along)
-        tangents = moved, direction[:3], direction[3:5]
-        return jax.jvp(factor, (osc, unknown, entry), tangents)
-
-    return jax.vmap(column, out_axes=(None, -1))(jnp.eye(5 + more))
+    return with_columns(factor, osc, along, jnp.concatenate([unknown, entry]))
 
 
 def admissible(osc: Oscillator, chain: Chain, z: Array) -> Array:
