@@ -239,9 +239,8 @@ class Sampling:
             self.variation.check(value)
         values = evenly_spaced(first, last, self.rows)
         grid = Grid(self._make, {"parameter": values}, (0.0, 0.0))
-        shape = len(values), len(self.starts)
         if isinstance(self.at, AtPhase):
-            return self._strobed(grid, values, shape)
+            return self._strobed(grid, values)
         found = self._results(grid, Attractor(), np.tile(self.starts.T, len(values)), LONG_ENOUGH)
         # Codes of runs that are not finite are NaN.
         kind = np.nan_to_num(found["kind"]).astype(int)
@@ -256,32 +255,36 @@ class Sampling:
             missing = ((0, 0), (0, points[0].shape[1] - 1))
             x1, x2 = (np.pad(x, missing, constant_values=np.nan) for x in (x1, x2))
             x1[cycles], x2[cycles] = points
+        period = np.where(kind == CYCLE, found["period"], np.nan)
+        return self._diagram(values, np.array(KINDS)[kind], period, status, x1, x2)
+
+    def _diagram(self, values: np.ndarray, *columns: np.ndarray) -> OrbitDiagram:
+        """The diagram of columns of all runs: kind, period, status, and points x1 and x2."""
+        shape = len(values), len(self.starts)
+        kind, period, status = (column.reshape(shape) for column in columns[:3])
+        x1, x2 = (column.reshape(*shape, -1) for column in columns[3:])
         return OrbitDiagram(
             values=values,
-            kind=np.array(KINDS)[kind].reshape(shape),
-            period=np.where(kind == CYCLE, found["period"], np.nan).reshape(shape),
-            status=status.reshape(shape),
-            x1=x1.reshape(*shape, -1),
-            x2=x2.reshape(*shape, -1),
+            kind=kind,
+            period=period,
+            status=status,
+            x1=x1,
+            x2=x2,
             at=self.at,
             name=self.variation.names[0],
             sampling=self,
             is_argument=not self.variation.varies_leaves,
         )
 
-    def _strobed(self, grid: Grid, values: np.ndarray, shape: tuple[int, int]) -> OrbitDiagram:
+    def _strobed(self, grid: Grid, values: np.ndarray) -> OrbitDiagram:
         """The diagram of a stroboscopic section: STROBES points behind PERIODS_LEFT_OUT periods."""
         first = [float(frequencies(self._make(value))[0]) for value in values]
-        period = 2 * np.pi / np.repeat(first, shape[1])
+        period = 2 * np.pi / np.repeat(first, len(self.starts))
         t1 = float(np.max(period)) * (PERIODS_LEFT_OUT + STROBES + 1)
-        observer = Along(_Strobes((self.at,), PERIODS_LEFT_OUT, STROBES))
+        reducer = _KeptMoments((self.at,), STROBES, ("x1", "x2"), PERIODS_LEFT_OUT)
         states = np.tile(self.starts.T, len(values))
-        found = self._results(grid, observer, states, t1, t0=0.0)
-        pieces = [f" {i}" for i in range(STROBES // 8)]
-        x1, x2 = (
-            np.concatenate([found[name + piece] for piece in pieces], axis=-1)
-            for name in ("x1", "x2")
-        )
+        found = self._results(grid, Along(reducer), states, t1, t0=0.0)
+        x1, x2 = reducer.columns(found)
         # Runs of other frequencies may have a period less.
         status = found["status"].astype(int)
         good = (status == Status.OK) | (status == Status.STUCK_FOREVER)
@@ -291,18 +294,8 @@ class Sampling:
         kind = np.where(good, kind, KINDS[UNDECIDED])
         once = (turns[:, None] > 0) & (np.arange(STROBES) >= turns[:, None])
         x1, x2 = (np.where(once, np.nan, x) for x in (x1, x2))
-        return OrbitDiagram(
-            values=values,
-            kind=kind.reshape(shape),
-            period=np.where(turns > 0, turns * period, np.nan).reshape(shape),
-            status=status.reshape(shape),
-            x1=x1.reshape(*shape, -1),
-            x2=x2.reshape(*shape, -1),
-            at=self.at,
-            name=self.variation.names[0],
-            sampling=self,
-            is_argument=not self.variation.varies_leaves,
-        )
+        period = np.where(turns > 0, turns * period, np.nan)
+        return self._diagram(values, kind, period, status, x1, x2)
 
     def _make(self, parameter: Any) -> Oscillator:
         return self.variation.make(parameter)
@@ -355,16 +348,14 @@ class Sampling:
         loops are cut off, [cycles].
         """
         at = (AtExtrema("x1"),) if self.at == AtExtrema("x1") else (AtExtrema("x1"), self.at)
-        observer = Along(_LoopPoints(at, MOMENTS_KEPT))
+        reducer = _KeptMoments(at, MOMENTS_KEPT)
         moments, cut = np.zeros((4, len(which), 0)), np.zeros(len(which), bool)
         state, began = np.stack([x1_max, np.zeros_like(x1_max)]), np.zeros_like(x1_max)
         remaining = np.arange(len(which))
         for _ in range(MOST_RUNS):
             until = float(np.max((end - began)[remaining])) * (1 + OUTSIDE)
-            found = self._results(grid, observer, state[:, remaining], until, which[remaining])
-            pieces = [f" {i}" for i in range(-(-MOMENTS_KEPT // 8))]
-            columns = ([found[name + piece] for piece in pieces] for name in OF_MOMENTS)
-            new = np.stack([np.concatenate(one, axis=-1) for one in columns])
+            left = state[:, remaining], until, which[remaining]
+            new = np.stack(reducer.columns(self._results(grid, Along(reducer), *left)))
             new[0] += began[remaining, None]
             # Where the room is used up, the next run begins at the last extremum, if there is one.
             cut[remaining] = new[0, :, -1] < end[remaining]
@@ -395,73 +386,55 @@ def _turns_in(x1: np.ndarray, x2: np.ndarray) -> np.ndarray:
     return turns
 
 
-@dataclass(frozen=True)
-class _Strobes:
-    """The states at the moments of a run behind the first `skipped` ones, `room` of them, a
-    multiple of eight. A reducer, see `sweep.sweep`, as `_LoopPoints`."""
-
-    at: tuple[Any, ...]
-    skipped: int
-    room: int
-
-    def init(self, osc, x1, x2):
-        pieces = tuple(jnp.full(8, jnp.nan) for _ in range(self.room // 8))
-        return pieces, pieces, jnp.zeros((), int) - self.skipped
-
-    def update(self, state, event):
-        kept1, kept2, count = state
-
-        def put(value, pieces):
-            places = (8 * i + jnp.arange(8) for i in range(len(pieces)))
-            pairs = zip(places, pieces, strict=True)
-            return tuple(jnp.where(place == count, value, piece) for place, piece in pairs)
-
-        return put(event.x1, kept1), put(event.x2, kept2), count + 1
-
-    def finish(self, state, end):
-        pairs = zip(("x1", "x2"), state[:2], strict=True)
-        return {f"{name} {i}": piece for name, own in pairs for i, piece in enumerate(own)}
-
-
 #: Numbers of the moments of a loop: extrema of x1, and the moments of the diagram, if different.
 EXTREMUM, OWN = 0, 1
 #: Results of `Attractor` with the place of an attractor at rest.
 RESTS_AT = ("x1_min", "x2_min")
 
 
-@dataclass(frozen=True)
-class _LoopPoints:
-    """The first `room` moments of a run: t, x1, x2 and the number in `at`. A reducer, see
-    `sweep.sweep`.
+#: Moments are kept in pieces of so many: larger arrays in all lanes make a slow kernel.
+PIECE_KEPT = 8
 
-    They are kept in pieces of eight: larger arrays in all lanes make a slow kernel.
-    """
+
+@dataclass(frozen=True)
+class _KeptMoments:
+    """The first `room` moments of a run behind some that are skipped: of t, x1, x2 and the moment's
+    number in `at` those in `kept`. A reducer, see `sweep.sweep`; room: a multiple of PIECE_KEPT."""
 
     at: tuple[Any, ...]
     room: int
+    kept: tuple[str, ...] = ("t", "x1", "x2", "moment")
+    skipped: int = 0
+
+    @property
+    def pieces(self) -> range:
+        return range(self.room // PIECE_KEPT)
 
     def init(self, osc, x1, x2):
-        pieces = [jnp.full(min(8, self.room - k), jnp.nan) for k in range(0, self.room, 8)]
-        return (tuple(pieces),) * 4, jnp.zeros((), int)
+        pieces = tuple(jnp.full(PIECE_KEPT, jnp.nan) for _ in self.pieces)
+        return (pieces,) * len(self.kept), jnp.zeros((), int) - self.skipped
 
     def update(self, state, event):
-        kept, count = state
+        known, count = state
 
-        def put(value, pieces):
-            places = (8 * i + jnp.arange(piece.size) for i, piece in enumerate(pieces))
+        def put(name, pieces):
+            value = getattr(event, name).astype(event.t.dtype)
+            places = (PIECE_KEPT * i + jnp.arange(PIECE_KEPT) for i in self.pieces)
             pairs = zip(places, pieces, strict=True)
             return tuple(jnp.where(place == count, value, piece) for place, piece in pairs)
 
-        new = event.t, event.x1, event.x2, event.moment.astype(event.t.dtype)
-        return tuple(map(put, new, kept)), count + 1
+        return tuple(map(put, self.kept, known)), count + 1
 
     def finish(self, state, end):
         return {
             f"{name} {i}": piece
-            for name, pieces in zip(OF_MOMENTS, state[0], strict=True)
+            for name, pieces in zip(self.kept, state[0], strict=True)
             for i, piece in enumerate(pieces)
         }
 
-
-#: Results for each moment.
-OF_MOMENTS = ("t", "x1", "x2", "number")
+    def columns(self, found: dict[str, np.ndarray]) -> list[np.ndarray]:
+        """What was kept of runs, [runs, room] each, from their results."""
+        return [
+            np.concatenate([found[f"{name} {i}"] for i in self.pieces], axis=-1)
+            for name in self.kept
+        ]
