@@ -19,6 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from ..activity import announced, note_progress
 from ..checks import as_whole, outside_of_traces, require, require_value
@@ -488,39 +489,24 @@ def _cycle_pieces(
 
 def _as_pieces(cycles: Sequence[Cycle], groups, stretches) -> list[_Piece]:
     pieces, found = [], _stacked(_row_of_branch, cycles)
+    status = found.pop("status")
     for stretch, values, rows in zip(stretches, groups, _consecutive(groups), strict=True):
-        fine = found.status[rows] == Status.OK
+        fine = status[rows] == Status.OK
         if np.any(fine):
-            here = jax.tree.map(lambda x, rows=rows[fine]: x[rows], found)
-            fields = {name: value for name, value in here._asdict().items() if name != "status"}
+            fields = {name: column[rows[fine]] for name, column in found.items()}
             own = tuple(cycles[row] for row in rows[fine].tolist())
             branch = Branch(kind="cycle", values=values[fine], cycles=own, **fields)
             pieces.append(_Piece(branch, stretch))
     return pieces
 
 
-class _Rows(NamedTuple):
-    """The fields of a `Branch` of cycles, and the status of each."""
-
-    status: Any
-    stable: Any
-    neutral: Any
-    x1_min: Any
-    x1_max: Any
-    x2_min: Any
-    x2_max: Any
-    period: Any
-    multiplier: Any
-    stick_durations: Any
-    stick_velocities: Any
-
-
 @jit
-def _row_of_branch(cycle: Cycle) -> _Rows:
+def _row_of_branch(cycle: Cycle) -> dict[str, Array]:
+    """The fields of a `Branch` at a cycle, and its status."""
     osc, chain = cycle.oscillator, cycle.chain
     stuck = jnp.any((chain.codes == 0) & chain.used[:, None], axis=0)
     speeds = jnp.stack([belt.velocity / osc.omega for belt in osc.belts])
-    return _Rows(
+    return dict(
         status=cycle.status,
         stable=cycle.stable,
         neutral=jnp.zeros_like(cycle.stable),
