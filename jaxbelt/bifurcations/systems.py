@@ -11,7 +11,7 @@ import abc
 import functools
 from collections.abc import Callable
 from itertools import combinations
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -178,7 +178,7 @@ class AbstractChainSystem(AbstractSystem):
     def weights(self, x):
         return WEIGHT / (1 + jnp.abs(x.reshape(-1)))
 
-    def refined(self, osc: Oscillator, x: Array) -> Self:
+    def refined(self, osc: Oscillator, x: Array) -> "AbstractChainSystem":
         """The same system with shorter integration steps on arcs that need them.
 
         The error of the steps in the equations at x decides; steps of length zero pad the other
