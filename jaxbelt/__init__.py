@@ -30,7 +30,8 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     sweeps/         naming forced_basins basins fractions orbit_diagram circle_map
     bifurcations/   special labels beside systems guesses base conditions forced tangencies
     bifurcations/   crossings rests edge_rests edges folds meetings connections infinity path scan
-    bifurcations/   refine tracks curves cells faces bounds regions branches diagrams switch_folds
+    bifurcations/   refine tracks curves cells faces bounds regions branches pieces diagrams
+    bifurcations/   switch_folds
     inverse/        selection record search fit margins design
     si              results in SI units
     plotting/       style phase histories forced points diagrams regions categories sweeps orbits
