@@ -21,7 +21,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     kernel/         lanes marks step events rounds waves clocked
     motion/         integrators arcs flights sensitivities sampling loops batches timed runs
     motion/         smoothing simulate
-    cycles/         chains settling shooting clocked periodic exponents orbits cycle
+    cycles/         chains settling shooting closure clocked periodic exponents orbits cycle
     cycles/         attractors functionals
     cycles/         backwards returns separatrices portrait unstable
     cycles/         outlines nearest sides shocks

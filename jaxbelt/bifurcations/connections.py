@@ -36,10 +36,11 @@ from jaxtyping import Array
 from ..checks import check_belt, is_concrete, pick
 from ..cycles.attractors import extent
 from ..cycles.chains import SIZES, Chain, Loop, cut, first_failure
+from ..cycles.closure import admissible
 from ..cycles.cycle import cycle_of
 from ..cycles.orbits import Orbit, follow_from, place_of_rest
 from ..cycles.separatrices import mode_onward
-from ..cycles.shooting import admissible, flow, meshed
+from ..cycles.shooting import flow, meshed
 from ..model.equilibria import pushes_away, saddles
 from ..model.modes import distinct_places, edges, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator

@@ -16,8 +16,9 @@ from jaxtyping import Array
 from ..checks import pick
 from ..cycles.attractors import sticks
 from ..cycles.chains import Chain
+from ..cycles.closure import closure, multiplier_and_slopes
 from ..cycles.orbits import first_loop, loop_of
-from ..cycles.shooting import closure, meshed, multiplier_and_slopes
+from ..cycles.shooting import meshed
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import each, jit

@@ -143,6 +143,7 @@ class _Piece(NamedTuple):
 
 
 def equilibrium_pieces(path: ParameterPath, nodes: Sequence[np.ndarray]) -> list[_Piece]:
+    """Those of equilibria, at the values of each stretch."""
     found = _stacked(candidates, map(path.at, np.concatenate(nodes)))
     pieces = []
     for stretch, rows in enumerate(_consecutive(nodes)):
@@ -172,6 +173,7 @@ def equilibrium_pieces(path: ParameterPath, nodes: Sequence[np.ndarray]) -> list
 def cycle_pieces(
     path: ParameterPath, nodes: Sequence[np.ndarray], labels: Sequence[Label]
 ) -> list[_Piece]:
+    """Those of cycles, attracting and unstable, at the values of each stretch; labels: of these."""
     wanted: list[tuple[int, np.ndarray, list[Loop]]] = []
     for stretch in range(len(labels)):
         for loops in path.strands(nodes[stretch].tolist()):

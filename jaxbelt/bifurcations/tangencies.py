@@ -24,8 +24,9 @@ import numpy as np
 from jaxtyping import Array
 
 from ..cycles.chains import SIZES, Chain, Loop, first_failure
+from ..cycles.closure import admissible
 from ..cycles.orbits import Orbit, follow, last_loop, loop_of
-from ..cycles.shooting import admissible, meshed, trace_of
+from ..cycles.shooting import meshed, trace_of
 from ..model.modes import STUCK, mode_acceleration, mode_of, select
 from ..model.oscillator import Oscillator
 from ..model.variations import Family

@@ -281,7 +281,7 @@ def monodromy(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
 
 @monodromy.def_jvp
 def _(primals, tangents):
-    # By columns, arc by arc, as in `shooting.closure`.
+    # By columns, arc by arc, as in `closure`.
     osc, chain, z = primals
     along, weights = directions_of(osc, tangents[0])
     matrix, by_z, by_osc = monodromy_and_slopes(osc, along, chain, z)

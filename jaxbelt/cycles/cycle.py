@@ -32,6 +32,7 @@ from ..model.modes import select
 from ..model.oscillator import Oscillator, check_oscillator, has_clock
 from ..model.own_units import in_given_units, in_own_units, quantity
 from ..model.rest import is_neutral
+from ..motion.arcs import Ends
 from ..motion.simulate import Arcs
 from ..numerics.compiling import any_lane, in_groups, jit
 from ..numerics.newton import HOLDS
@@ -39,19 +40,10 @@ from ..numerics.padding import longer
 from ..results import Status, describe, draw
 from ..tables import per_belt, require_single, table_of
 from .chains import SIZES, Chain, Loop, first_failure, loop_events, modes_of, room_of
+from .closure import admissible, closure
 from .orbits import MOST_ARCS, follow, last_loop, loop_of
 from .periodic import motion_reached
-from .shooting import (
-    ARC_STEPS,
-    Ends,
-    admissible,
-    closed,
-    closure,
-    flow,
-    meshed,
-    residual,
-    solve_closed,
-)
+from .shooting import ARC_STEPS, closed, flow, meshed, residual, solve_closed
 
 if TYPE_CHECKING:
     import pandas
