@@ -21,8 +21,8 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     kernel/         lanes marks step events rounds waves clocked
     motion/         integrators arcs flights sensitivities sampling loops batches timed runs
     motion/         smoothing simulate
-    cycles/         chains settling shooting closure clocked periodic exponents orbits cycle
-    cycles/         attractors functionals
+    cycles/         chains settling shooting closure clocked followed periodic exponents orbits
+    cycles/         cycle attractors functionals
     cycles/         backwards returns separatrices portrait unstable
     cycles/         outlines nearest sides shocks
     sweeps/         observers moments along reducers attractor strobes queue threads audit

@@ -42,8 +42,8 @@ from ..cycles.clocked import (
     timed_residual,
     turns_of,
 )
+from ..cycles.followed import Followed
 from ..cycles.periodic import (
-    Followed,
     PeriodicMotion,
     attracted,
     extrema_of,

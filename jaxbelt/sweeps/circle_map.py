@@ -29,7 +29,8 @@ from ..checks import (
     require_value,
 )
 from ..cycles.clocked import forcing_period, turns_of
-from ..cycles.periodic import PERIODS_AT_ONCE, PeriodicMotion, periodic_from
+from ..cycles.followed import PERIODS_AT_ONCE
+from ..cycles.periodic import PeriodicMotion, periodic_from
 from ..kernel.clocked import of_lanes
 from ..kernel.lanes import Observer, Variable
 from ..model.forcing import Oscillating

@@ -11,7 +11,8 @@ import numpy as np
 
 from ..cycles.attractors import RUN, distance
 from ..cycles.clocked import turns_of
-from ..cycles.periodic import PERIODS_AT_ONCE, PeriodicMotion, nothing_found, periodic
+from ..cycles.followed import PERIODS_AT_ONCE
+from ..cycles.periodic import PeriodicMotion, nothing_found, periodic
 from ..model.oscillator import Oscillator
 from ..results import Status
 from .datasets import decoded
