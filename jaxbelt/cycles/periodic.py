@@ -35,7 +35,7 @@ from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS
 from ..results import Status, describe, draw
 from ..tables import per_belt, require_single, table_of
-from .chains import SIZES, Loop, first_failure, loop_events
+from .chains import SIZES, Loop, blank_loop, first_failure, loop_events
 from .clocked import (
     TimedChain,
     extrema_along,
@@ -359,13 +359,8 @@ def motion_at_unknowns(osc: Oscillator, chain: TimedChain, z: Array) -> Periodic
 
 def nothing_found(osc: Oscillator, turns: int, status: int) -> PeriodicMotion:
     """What is returned where there is no motion: NaN, and why."""
-    n, arcs = len(osc.belts), SIZES[0]
-    chain = TimedChain(
-        jnp.ones((arcs, n)),
-        jnp.full(arcs, Ends(n).unused),
-        jnp.zeros((arcs, 1)),
-        turns=turns,
-    )
+    arcs, loop = SIZES[0], blank_loop(SIZES[0], len(osc.belts))
+    chain = TimedChain(loop.codes, loop.ends, jnp.zeros((arcs, 1)), turns=turns)
     nan, none = jnp.asarray(jnp.nan), jnp.full((arcs, 4), jnp.nan)
     found = jnp.full(2, jnp.nan, complex)
     return PeriodicMotion(osc, chain, none, found, nan, jnp.asarray(0), jnp.asarray(status))
