@@ -25,8 +25,9 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     cycles/         cycle attractors functionals
     cycles/         backwards returns separatrices portrait unstable
     cycles/         outlines nearest sides shocks
-    sweeps/         observers moments along reducers attractor strobes queue threads audit
-    sweeps/         grid datasets question locks store progress work clusters sweep shares
+    sweeps/         observers moments along reducers attractor strobes queue threads
+    sweeps/         runs_in_memory audit grid datasets question locks store progress work
+    sweeps/         clusters sweep shares
     sweeps/         naming forced_basins basins fractions orbit_diagram circle_map
     bifurcations/   special labels beside systems guesses base conditions forced tangencies
     bifurcations/   crossings rests edge_rests edges folds meetings connections infinity path scan

@@ -235,8 +235,7 @@ class SlidingExchange(AbstractCycleCondition):
         sticks = jnp.any(loop.codes[:, belts] == 0, axis=-1)
         both_touch = jnp.all(jnp.abs(loop.codes[:, belts]) < 1.5, axis=-1)
         exchanges = jnp.any(loop.used & sticks & both_touch)
-        meant = (status != Status.OK) | exchanges
-        status = jnp.where(meant, status, Status.NOT_TOUCHED.value)
+        status = first_failure(status, exchanges, Status.NOT_TOUCHED)
         return Encounter(chain, belts, jnp.asarray(-1), jnp.zeros(())), z, status
 
     def solve(self, variation, osc, value, guess):

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..checks import is_concrete, pick, require_value
-from ..cycles.chains import SIZES, Chain, Loop, after_each
+from ..cycles.chains import SIZES, Chain, Loop, after_each, first_failure
 from ..cycles.shooting import meshed
 from ..model.modes import Mode, any_of, capacity, edges, mode_acceleration
 from ..model.oscillator import Oscillator
@@ -125,7 +125,7 @@ class EdgeExchange(AbstractCycleCondition, _BetweenEdges):
     def system(self, osc, loop, status):
         distance, row, pair = _passage_of_edges(osc, loop, self.belts)
         exists = jnp.isfinite(distance) & _both_rub(osc, self.belts)
-        status = jnp.where(exists | (status != Status.OK), status, Status.NOT_TOUCHED.value)
+        status = first_failure(status, exists, Status.NOT_TOUCHED)
         chain, z = meshed(osc, loop)
         return EdgesPassed(chain, row, pair), z, status
 

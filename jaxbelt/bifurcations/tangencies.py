@@ -140,10 +140,10 @@ class AbstractTangency(AbstractStickCondition):
 
     def system(self, osc, loop, status):
         fits = jnp.sum(loop.used) < loop.ends.size  # it may need one more arc
-        status = jnp.where(fits | (status != Status.OK), status, Status.TOO_MANY_ARCS.value)
+        status = first_failure(status, fits, Status.TOO_MANY_ARCS)
         loop, row, found = _with_stick(osc, loop, self.belt)
         chain, z = meshed(osc, loop)
-        status = jnp.where(found | (status != Status.OK), status, Status.NOT_TOUCHED.value)
+        status = first_failure(status, found, Status.NOT_TOUCHED)
         status = jnp.where(velocity_of(osc, self.belt) == 0, Status.STUCK_FOREVER.value, status)
         # The arc before the stick arc is the one that becomes tangent.
         before = (row - 1) % jnp.maximum(jnp.sum(chain.used), 1)

@@ -45,9 +45,9 @@ from .datasets import decoded, flags
 from .forced_basins import forced_labels
 from .naming import Found, is_cycle, told_apart, words_for
 from .question import LONG_ENOUGH, as_start, settings_of_runs
+from .runs_in_memory import results_from
 from .strobes import FORCED_KINDS, ForcedAttractor
 from .sweep import sweep
-from .work import results_from
 
 if TYPE_CHECKING:
     import pandas

@@ -42,7 +42,6 @@ from .moments import AtEvents, AtExtrema, AtPhase, AtSection
 from .question import LONG_ENOUGH
 from .reducers import check_sections
 from .strobes import SAME
-from .work import results_of
 
 if TYPE_CHECKING:
     import pandas
@@ -311,13 +310,8 @@ class Sampling:
     ) -> dict[str, np.ndarray]:
         """Results of an observer for runs from states, [2, runs]; which: their numbers, or all."""
         which = np.arange(states.shape[1]) if which is None else which
-
-        def rows_of(first: int, last: int) -> np.ndarray:
-            rows = grid.rows(which[first:last] // len(self.starts))
-            return np.concatenate([states[None, :, first:last], rows[:, 2:]], axis=1)
-
         numbers = {"t1": t1, "t0": t0, **self.numbers}
-        return results_of(grid.program(observer), grid.shared, rows_of, len(which), **numbers)
+        return grid.results(observer, states, which // len(self.starts), **numbers)
 
     def _loops(self, grid: Grid, which: np.ndarray, x1_min, x1_max, period):
         """Status, x1 and x2 of the moments of one loop of cycles, [cycles] and [cycles, points].

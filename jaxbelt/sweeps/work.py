@@ -1,19 +1,13 @@
 """The work of a sweep: runs through the kernel, by blocks into memory or a store, or one by one."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import jax
 import numpy as np
-from jaxtyping import Array
 
-from ..kernel.lanes import Observer, Program
-from ..model.oscillator import has_edges
-from ..model.own_units import OwnOscillator
 from .datasets import Memory
 from .question import Question
-from .queue import by_name, column_of, layout
+from .queue import column_of
 from .store import Store
 from .threads import run
 
@@ -64,44 +58,6 @@ def do_runs(
         derivatives=len(question.derivatives),
         **options,
     )
-
-
-def results_of(
-    program: Program,
-    shared: list[Array],
-    rows_of: Callable[[int, int], np.ndarray],
-    runs: int,
-    *,
-    t1: float,
-    rtol: float,
-    atol: float | None,
-    t0: float | None = None,
-) -> dict[str, np.ndarray]:
-    """Results of runs by name, [runs, ...], in the order of the runs; arguments as for
-    `threads.run`."""
-    shapes = layout(program, shared)
-    columns = np.zeros((sum(math.prod(shape) for shape in shapes.values()), runs))
-
-    def put(places: np.ndarray, results: np.ndarray) -> None:
-        columns[:, places] = results[0]
-
-    run(program, shared, rows_of, runs, put, t1=t1, rtol=rtol, atol=atol, t0=t0)
-    return by_name(shapes, columns)
-
-
-def results_from(
-    own: OwnOscillator, observer: Observer, starts: np.ndarray, **numbers: Any
-) -> dict[str, np.ndarray]:
-    """`results_of` of one oscillator, as of `in_units_of_run`, from starts (x1, x2), [2, runs], or
-    (x1, x2, t), [3, runs]; numbers: t1, rtol, atol, t0."""
-    leaves, structure = jax.tree.flatten(own)
-    mapped, own_t0 = (False,) * len(leaves), len(starts) == 3
-    program = Program(structure, mapped, observer, has_edges(own), own_t0=own_t0)
-
-    def rows_of(first: int, last: int) -> np.ndarray:
-        return starts[None, :, first:last]
-
-    return results_of(program, leaves, rows_of, starts.shape[1], **numbers)
 
 
 def counts(statuses: np.ndarray) -> dict[int, int]:
