@@ -29,8 +29,8 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     sweeps/         runs_in_memory audit grid datasets question locks store progress work
     sweeps/         clusters sweep shares
     sweeps/         naming forced_basins basins fractions orbit_diagram circle_map
-    bifurcations/   special labels beside systems guesses base conditions forced tangencies
-    bifurcations/   crossings rests edge_rests edges folds meetings connections infinity path scan
+    bifurcations/   special labels beside systems timed_systems guesses base conditions forced
+    bifurcations/   tangencies crossings rests edge_rests edges folds meetings connections infinity path scan
     bifurcations/   refine tracks curves cells faces bounds regions branches pieces diagrams
     bifurcations/   switch_folds
     inverse/        selection record search fit margins design

@@ -35,7 +35,7 @@ from ..tables import per_belt, table_of
 from .base import BifurcationPoint, given_point
 from .branches import MotionRow, forced_branches
 from .cells import in_plane_of_paper, region_name
-from .forced import motions_to_begin_from, place_of_motion
+from .forced import motions_to_begin_from
 from .path import ParameterPath
 from .pieces import (
     Branch,
@@ -46,6 +46,7 @@ from .pieces import (
     separated_stretches,
 )
 from .scan import by_value, edges_touched, is_at_one_value, search
+from .timed_systems import place_of_motion
 
 if TYPE_CHECKING:
     import pandas
