@@ -15,8 +15,9 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     tables          results as tables
     numerics/       padding derivatives implicit extrapolation newton continuation
     numerics/       roots control_points
-    model/          friction forcing oscillator own_units machine parameters variations modes
-    model/          pseudofocus transitions instants rest events equilibria far_out
+    model/          friction forcing oscillator own_units machine parameters families
+    model/          variations modes pseudofocus transitions instants rest events equilibria
+    model/          far_out
     presets         the published systems
     kernel/         lanes marks step events rounds waves clocked
     motion/         integrators arcs flights sensitivities sampling loops batches timed runs
@@ -30,9 +31,9 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     sweeps/         clusters sweep shares
     sweeps/         naming forced_basins basins fractions orbit_diagram circle_map
     bifurcations/   special labels beside systems timed_systems guesses base conditions forced
-    bifurcations/   tangencies crossings rests edge_rests edges folds meetings connections infinity path scan
-    bifurcations/   refine tracks curves cells faces bounds regions branches pieces diagrams
-    bifurcations/   switch_folds
+    bifurcations/   tangencies crossings rests edge_rests edges folds meetings connections
+    bifurcations/   infinity path scan refine tracks curves cells faces bounds regions branches
+    bifurcations/   pieces diagrams switch_folds
     inverse/        selection record search fit margins design
     si              results in SI units
     plotting/       style phase histories forced points diagrams regions categories sweeps orbits

@@ -33,9 +33,10 @@ from ..checks import check_belt, is_concrete, number, require, require_value
 from ..cycles.attractors import PLACE_DIMENSIONS, place_of
 from ..cycles.chains import SIZES, Chain, Loop, blank_loop
 from ..cycles.cycle import Cycle
+from ..model.families import Family
 from ..model.oscillator import Oscillator, has_clock
 from ..model.own_units import in_own_units, quantity, rescaled
-from ..model.variations import Family, Variation
+from ..model.variations import Variation
 from ..results import Status, describe, draw
 from ..tables import require_single, table_of
 from .beside import Side

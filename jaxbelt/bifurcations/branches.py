@@ -21,9 +21,10 @@ from ..activity import note_progress
 from ..cycles.clocked import TimedChain, timed_blocks, turns_of
 from ..cycles.periodic import PeriodicMotion, is_same_motion, motion_at_unknowns, periodic_from
 from ..cycles.shooting import jacobian
+from ..model.families import Family
 from ..model.oscillator import Oscillator
 from ..model.own_units import in_own_units
-from ..model.variations import Family, Variation
+from ..model.variations import Variation
 from ..numerics.continuation import Corrected
 from ..results import Status
 from .base import AbstractCondition, BifurcationPoint

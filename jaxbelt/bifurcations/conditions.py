@@ -20,8 +20,8 @@ from ..checks import require_one_float, traceable
 from ..cycles.chains import SIZES, Chain, Loop, cut
 from ..cycles.cycle import Cycle, cycle_of
 from ..cycles.shooting import ARC_STEPS, meshed
+from ..model.families import Family
 from ..model.oscillator import Oscillator
-from ..model.variations import Family
 from ..numerics.compiling import jit
 from ..results import Status
 from .base import AbstractCondition, point_of

@@ -42,9 +42,9 @@ from ..cycles.orbits import Orbit, follow_from, place_of_rest
 from ..cycles.separatrices import mode_onward
 from ..cycles.shooting import flow, meshed
 from ..model.equilibria import pushes_away, saddles
+from ..model.families import Family
 from ..model.modes import distinct_places, edges, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
-from ..model.variations import Family
 from ..motion.arcs import Ends
 from ..numerics.compiling import each, jit
 from ..numerics.continuation import Stop

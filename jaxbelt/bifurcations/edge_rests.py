@@ -29,6 +29,7 @@ from jaxtyping import Array
 
 from ..checks import is_concrete, require_value
 from ..model.equilibria import EquilibriumKind
+from ..model.families import Family
 from ..model.modes import (
     Mode,
     capacity,
@@ -43,7 +44,6 @@ from ..model.modes import (
 from ..model.oscillator import Oscillator
 from ..model.pseudofocus import edge_focus, field_at_rest
 from ..model.transitions import contact_beside
-from ..model.variations import Family
 from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS
 from ..results import Status

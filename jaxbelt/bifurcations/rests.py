@@ -29,6 +29,7 @@ from ..checks import pick
 from ..cycles.orbits import Orbit
 from ..cycles.shooting import trace_of
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates, edge_rounding
+from ..model.families import Family
 from ..model.modes import (
     STUCK,
     boundary_guards,
@@ -42,7 +43,7 @@ from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
 from ..model.pseudofocus import edge_focus
 from ..model.transitions import contact_beside
-from ..model.variations import Family, Variation
+from ..model.variations import Variation
 from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS
 from ..results import Status

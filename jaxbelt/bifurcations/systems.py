@@ -24,9 +24,9 @@ from ..cycles.attractors import extent
 from ..cycles.chains import Chain, after_each, first_failure, following_codes
 from ..cycles.cycle import Cycle, cycle_of
 from ..cycles.shooting import jacobian, meshed, residual, residual_and_blocks
+from ..model.families import Family
 from ..model.modes import capacity, edge_guards, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
-from ..model.variations import Family
 from ..motion.arcs import Ends
 from ..numerics.implicit import Equations, solution
 from ..numerics.newton import HOLDS, STEP_ROUNDING, is_settled, newton, solve

@@ -27,9 +27,9 @@ from ..cycles.chains import SIZES, Chain, Loop, first_failure
 from ..cycles.closure import admissible
 from ..cycles.orbits import Orbit, follow, last_loop, loop_of
 from ..cycles.shooting import meshed, trace_of
+from ..model.families import Family
 from ..model.modes import STUCK, mode_acceleration, mode_of, select
 from ..model.oscillator import Oscillator
-from ..model.variations import Family
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS, newton

@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
+from ..model.families import Family
 from ..model.oscillator import Oscillator
-from ..model.variations import Family, Variation
+from ..model.variations import Variation
 from ..numerics.compiling import jit
 from ..numerics.continuation import Corrected, CurvePoint, corrected
 from .base import BifurcationPoint
