@@ -412,11 +412,8 @@ class Variation:
         """The value, near `start`, of the one parameter, at which a belt is at rest."""
         value = float(start)
         for _ in range(PASSES):
-            family = self.family(np.array([value]))
-            velocity = family.at(np.array([value])).belts[belt].velocity
-            change = -float(velocity) / float(family.belt_slopes(belt, "velocity")[0])
-            value += change
-            if not abs(change) > ROUNDING:
+            before, (value,) = value, self.family(np.array([value])).zeros([(belt, "velocity")])
+            if not abs(value - before) > ROUNDING:
                 break
         return value
 
