@@ -34,7 +34,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     bifurcations/   tangencies crossings rests edge_rests edges folds meetings connections
     bifurcations/   infinity path scan refine tracks curves cells faces bounds regions branches
     bifurcations/   pieces diagrams switch_folds
-    inverse/        selection record search fit margins design
+    inverse/        selection record search windows fit margins design
     si              results in SI units
     plotting/       style phase histories forced points diagrams regions categories sweeps orbits
     plotting/       inverse model draw si explorer
