@@ -135,9 +135,6 @@ class AbstractForcedCondition(AbstractCondition):
 
     ends_at_contact: ClassVar[bool] = True
 
-    def kind_along(self, osc, multiplier) -> type[AbstractCondition]:
-        return type(self)
-
     def check(self, osc):
         super().check(osc)
         check_clock(osc, type(self).__name__, "the conditions for oscillators without")
