@@ -22,10 +22,9 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     kernel/         lanes marks step events rounds waves clocked
     motion/         integrators arcs flights sensitivities sampling loops batches timed runs
     motion/         smoothing simulate
-    cycles/         chains settling shooting closure clocked followed periodic exponents orbits
-    cycles/         cycle attractors functionals
-    cycles/         backwards returns separatrices portrait unstable
-    cycles/         outlines nearest sides shocks
+    cycles/         chains settling shooting motions closure clocked followed periodic exponents
+    cycles/         orbits cycle attractors functionals backwards returns separatrices portrait
+    cycles/         unstable outlines nearest sides shocks
     sweeps/         observers moments along reducers attractor strobes queue threads
     sweeps/         runs_in_memory audit grid datasets question locks store progress work
     sweeps/         clusters sweep shares

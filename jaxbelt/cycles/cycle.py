@@ -10,7 +10,6 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -24,26 +23,25 @@ from ..checks import (
     is_concrete,
     number,
     pick,
-    require,
 )
-from ..model.events import Signature, signature_name
+from ..model.events import signature_name
 from ..model.friction import jump_and_kink
 from ..model.modes import select
 from ..model.oscillator import Oscillator, check_oscillator, has_clock
 from ..model.own_units import in_given_units, in_own_units, quantity
 from ..model.rest import is_neutral
 from ..motion.arcs import Ends
-from ..motion.simulate import Arcs
 from ..numerics.compiling import any_lane, in_groups, jit
 from ..numerics.newton import HOLDS
 from ..numerics.padding import longer
 from ..results import Status, describe, draw
 from ..tables import per_belt, require_single, table_of
-from .chains import SIZES, Chain, Loop, first_failure, loop_events, modes_of, room_of
+from .chains import SIZES, Chain, Loop, first_failure, modes_of, room_of
 from .closure import admissible, closure
+from .motions import ClosedMotion
 from .orbits import MOST_ARCS, follow, last_loop, loop_of
 from .periodic import motion_reached
-from .shooting import ARC_STEPS, closed, flow, meshed, residual, solve_closed
+from .shooting import ARC_STEPS, closed, meshed, residual, solve_closed
 
 if TYPE_CHECKING:
     import pandas
@@ -61,7 +59,7 @@ DISTINCT = 1e-2
 SAME_SPEED = 1e-9
 
 
-class Cycle(eqx.Module):
+class Cycle(ClosedMotion):
     """A steady cycle, differentiable with respect to every parameter of its oscillator.
 
     A cycle that sticks begins at the end of its longest stick phase, any other at its largest x1.
@@ -91,13 +89,6 @@ class Cycle(eqx.Module):
         return jnp.sum(self.unknowns[..., 2], axis=-1)
 
     @property
-    def stick_durations(self) -> Array:
-        """Time stuck to each belt in one loop, summed over its stick phases, [belts]."""
-        # A product, so that NaN stays, also for a belt that the mass does not stick to.
-        stuck = jnp.where(self.chain.codes == 0, 1.0, 0.0)
-        return jnp.sum(self.unknowns[..., 2:] * stuck, axis=-2)
-
-    @property
     def x1_min(self) -> Array:
         """Smallest displacement."""
         return jnp.min(self.unknowns[..., 0], axis=-1)
@@ -121,44 +112,6 @@ class Cycle(eqx.Module):
     def stable(self) -> Array:
         """Whether it attracts: `|multiplier|` < 1."""
         return jnp.abs(self.multiplier) < 1
-
-    @property
-    def arcs(self) -> Arcs:
-        """The arcs, smooth pieces in one mode each; NaN, or cut off, where unused."""
-        used = self.chain.used
-        nan = functools.partial(jnp.where, used)
-        entries = jnp.cumsum(self.unknowns[..., 2], axis=-1) - self.unknowns[..., 2]
-        arcs = Arcs(
-            t=nan(entries, jnp.nan),
-            y=jnp.where(used[..., None], self.unknowns[..., :2], jnp.nan),
-            mode=self.chain.codes,
-            duration=nan(self.unknowns[..., 2], jnp.nan),
-        )
-        if is_concrete(self.unknowns) and used.ndim == 1:
-            arcs = pick(arcs, slice(int(np.sum(used))))
-        return arcs
-
-    @property
-    def signature(self) -> Signature:
-        """The events of one loop, ((kind, belt), ...); outside of transformations only."""
-        require(
-            is_concrete(self.chain) and self.chain.ends.ndim == 1,
-            "signature",
-            "asked of one cycle outside of transformations",
-            "a traced or batched cycle",
-        )
-        return loop_events(self.chain) if int(self.status) == Status.OK else ()
-
-    def sample(self, n: int) -> Array:
-        """States evenly spread in time over one period.
-
-        Args:
-            n: Number of states, ends included.
-
-        Returns:
-            The states (x1, x2), [n, 2].
-        """
-        return sample_cycle(self.oscillator, self.chain, self.unknowns, as_whole(n, "n"))
 
     def row(self) -> dict[str, Any]:
         """The row of the cycle in `table`."""
@@ -239,20 +192,6 @@ def as_loop(cycle: Cycle, size: int) -> Loop:
     source = np.where(own, np.arange(size), 0)
     ends = jnp.where(own, chain.ends[source], Ends(chain.codes.shape[-1]).unused)
     return Loop(chain.codes[source], ends, z[source, :2], jnp.where(own, z[source, 2], 0.0))
-
-
-@jit
-def sample_cycle(osc: Oscillator, chain: Chain, z: Array, n: int) -> Array:
-    """States at n times evenly spread over one period of a closed chain with the unknowns z."""
-    durations = z[:, 2]
-    ends = jnp.cumsum(durations)
-
-    def at(t):
-        i = jnp.minimum(jnp.searchsorted(ends, t).astype(int), jnp.sum(chain.used) - 1)
-        since = t - ends[i] + durations[i]
-        return flow(osc, chain.codes[i], chain.mesh[i], z[i, :2], since)
-
-    return jax.vmap(at)(jnp.linspace(0.0, 1.0, n) * ends[-1])
 
 
 def cycle_of(

@@ -4,7 +4,6 @@ An orbit is followed for n periods of the forcing; its arcs are the signature an
 which `clocked` solves for the motion that repeats after them.
 """
 
-import functools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -22,20 +21,18 @@ from ..checks import (
     check_finite,
     is_concrete,
     number,
-    pick,
     require,
 )
-from ..model.events import Signature, signature_name
+from ..model.events import signature_name
 from ..model.modes import STUCK
 from ..model.oscillator import Oscillator, check_clock, check_oscillator
 from ..model.own_units import in_given_units, in_own_units, quantity
 from ..motion.arcs import Ends
-from ..motion.simulate import Arcs
 from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS
 from ..results import Status, describe, draw
 from ..tables import per_belt, require_single, table_of
-from .chains import SIZES, Loop, blank_loop, first_failure, loop_events
+from .chains import SIZES, Loop, blank_loop, first_failure
 from .clocked import (
     TimedChain,
     extrema_along,
@@ -52,7 +49,7 @@ from .clocked import (
     turns_of,
 )
 from .followed import PERIODS_AT_ONCE, Followed, after_period, arcs_over
-from .shooting import flow
+from .motions import ClosedMotion
 
 if TYPE_CHECKING:
     import pandas
@@ -69,7 +66,7 @@ SAME_STATE = 1e-7
 OUTER_STEPS = 12
 
 
-class PeriodicMotion(eqx.Module):
+class PeriodicMotion(ClosedMotion):
     """A motion of a forced oscillator that repeats after n periods of the forcing.
 
     Differentiable with respect to every parameter of its oscillator.
@@ -125,12 +122,6 @@ class PeriodicMotion(eqx.Module):
         return self.unknowns[jnp.asarray(np.append(0, cuts[:-1] + 1)), :2]
 
     @property
-    def stick_durations(self) -> Array:
-        """Time that it sticks to each belt, [belts], in all its periods."""
-        stuck = jnp.where(self.chain.codes == STUCK, 1.0, 0.0)
-        return jnp.sum(self.unknowns[..., 3:] * stuck, axis=-2)
-
-    @property
     def x1_min(self) -> Array:
         """Smallest displacement."""
         return extrema_of(self)[..., 0]
@@ -154,33 +145,6 @@ class PeriodicMotion(eqx.Module):
     def stable(self) -> Array:
         """Whether both multipliers are inside of the unit circle."""
         return jnp.all(jnp.abs(self.multipliers) < 1, axis=-1)
-
-    @property
-    def arcs(self) -> Arcs:
-        """The arcs, smooth pieces in one mode each; NaN, or cut off, where unused."""
-        used, durations = self.chain.used, self.unknowns[..., 3]
-        nan = functools.partial(jnp.where, used)
-        arcs = Arcs(
-            t=nan(jnp.cumsum(durations, axis=-1) - durations, jnp.nan),
-            y=jnp.where(used[..., None], self.unknowns[..., :2], jnp.nan),
-            mode=self.chain.codes,
-            duration=nan(durations, jnp.nan),
-        )
-        if is_concrete(self.unknowns) and used.ndim == 1:
-            arcs = pick(arcs, slice(int(np.sum(used))))
-        return arcs
-
-    @property
-    def signature(self) -> Signature:
-        """Its events, (kind, belt) each; outside of transformations only."""
-        fits = is_concrete(self.chain) and self.chain.ends.ndim == 1
-        expected = "asked of one motion outside of transformations"
-        require(fits, "signature", expected, "a traced or batched motion")
-        return loop_events(self.chain) if int(self.status) == Status.OK else ()
-
-    def sample(self, n: int) -> Array:
-        """States (x1, x2) at n times evenly spread over its period, ends included, [n, 2]."""
-        return _sampled_motion(self.oscillator, self.chain, self.unknowns, as_whole(n, "n"))
 
     def at(self, osc: Oscillator) -> "PeriodicMotion":
         """The motion with the same signature of another oscillator, near to its own.
@@ -269,18 +233,6 @@ def extrema_of(motion: PeriodicMotion) -> Array:
 
 
 _extrema = jit(extrema_along)
-
-
-@jit
-def _sampled_motion(osc: Oscillator, chain: TimedChain, z: Array, n: int) -> Array:
-    ends = jnp.cumsum(z[:, 3])
-
-    def at(t):
-        i = jnp.minimum(jnp.searchsorted(ends, t).astype(int), jnp.sum(chain.used) - 1)
-        since = t - ends[i] + z[i, 3]
-        return flow(osc, chain.codes[i], chain.mesh[i], z[i, :3], since)[:2]
-
-    return lax.map(at, jnp.linspace(0.0, 1.0, n) * ends[-1])
 
 
 # --- solutions ------------------------------------------------------------------------------------
