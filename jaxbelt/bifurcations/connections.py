@@ -43,7 +43,7 @@ from ..cycles.separatrices import mode_onward
 from ..cycles.shooting import flow, meshed
 from ..model.equilibria import pushes_away, saddles
 from ..model.families import Family
-from ..model.modes import distinct_places, edges, mode_acceleration, mode_of
+from ..model.modes import distinct_places, edge_at, edges, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
 from ..motion.arcs import Ends
 from ..numerics.compiling import each, jit
@@ -83,11 +83,11 @@ class Connection(CycleSystem):
     arrives: Array
 
     def condition(self, osc, z, miss):
-        return z[-1, 0] - jnp.stack(edges(osc))[self.arrives]
+        return z[-1, 0] - edge_at(osc, self.arrives)
 
     def _beginning(self, osc: Oscillator, entry: Array) -> Array:
         """Difference of its first state from its saddle, [2]."""
-        return entry - jnp.stack([jnp.stack(edges(osc))[self.leaves], jnp.zeros(())])
+        return entry - jnp.stack([edge_at(osc, self.leaves), jnp.zeros(())])
 
     def residual(self, osc, x):
         closed = super().residual(osc, x)
@@ -133,7 +133,7 @@ class Connection(CycleSystem):
         # The weakest push away from either saddle.
         away = jnp.stack(pushes_away(osc))[:, jnp.stack([self.leaves, self.arrives])]
         tests["BoundaryEquilibrium", ()] = jnp.min(away)
-        leaves, arrives = jnp.stack(edges(osc))[jnp.stack([self.leaves, self.arrives])]
+        leaves, arrives = edge_at(osc, jnp.stack([self.leaves, self.arrives]))
         tests["MeetingEdges", ()] = jnp.where(leaves == arrives, jnp.nan, leaves - arrives)
         return Seen(tests, exists, jnp.asarray(jnp.nan), error)
 
@@ -243,7 +243,7 @@ class SaddleConnection(AbstractCondition):
 
 
 def _from_edge(osc: Oscillator, codes: Array, x1: Array, edge: Array) -> Array:
-    return x1 - jnp.stack(edges(osc))[edge]
+    return x1 - edge_at(osc, edge)
 
 
 @jit
@@ -291,7 +291,7 @@ def _states_on(osc: Oscillator, system: Connection, x: Array) -> Array:
 
 def _departing(osc: Oscillator, edge: Array, rightward: Array, parts: Array, budget: int) -> Orbit:
     """The orbit that leaves the saddle of an edge to one side; parts: whether there is one."""
-    x1 = jnp.where(parts, jnp.stack(edges(osc))[edge], 0.0)
+    x1 = jnp.where(parts, edge_at(osc, edge), 0.0)
     status = jnp.where(parts, Status.OK.value, Status.NOT_FINITE.value)
     y = jnp.stack([x1, jnp.zeros(())])
     return follow_from(osc, mode_onward(osc, x1, rightward), y, status, budget)

@@ -21,7 +21,7 @@ from ..checks import is_concrete
 from ..cycles.chains import SIZES, Chain, Loop, cut, first_failure
 from ..cycles.cycle import Cycle
 from ..cycles.shooting import meshed
-from ..model.modes import any_of, mode_of, select
+from ..model.modes import any_of, mode_of, select, velocity_of
 from ..model.oscillator import Belt, Oscillator
 from ..model.transitions import stick_limit
 from ..motion.arcs import Ends
@@ -37,7 +37,6 @@ from .systems import (
     contact_tests,
     nearest_contacts,
     stick_phase_from,
-    velocity_of,
 )
 from .tangencies import Encounter
 

@@ -25,7 +25,7 @@ from ..cycles.chains import SIZES, Chain, Loop, first_failure, following_codes
 from ..cycles.settling import AT_REST
 from ..cycles.shooting import end_guard, meshed
 from ..cycles.unstable import separating_loop
-from ..model.modes import edges, mode_acceleration, mode_of, select
+from ..model.modes import edge_at, edges, mode_acceleration, mode_of, select
 from ..model.oscillator import Oscillator
 from ..model.transitions import onset_position
 from ..motion.arcs import Ends
@@ -376,7 +376,7 @@ def _without_excursion(osc: Oscillator, loop: Loop, near: EdgeEnd) -> tuple[Loop
     names = Ends(n)
     rows, count = jnp.arange(loop.ends.size), jnp.maximum(jnp.sum(loop.used), 1)
     passes = (loop.ends >= n) & (loop.ends < 3 * n)
-    edge = jnp.stack(edges(osc))[jnp.clip(near.end - n, 0, 2 * n - 1)]
+    edge = edge_at(osc, jnp.clip(near.end - n, 0, 2 * n - 1))
     passes = passes & (loop.exits[:, 0] == edge)
     # The events before and after; extremum of x2 are none.
     events = loop.used & (loop.ends != names.extremum_x2) & (rows != row)

@@ -18,13 +18,13 @@ from ..checks import pick
 from ..cycles.chains import Loop, first_failure, following_codes
 from ..cycles.orbits import Orbit, before_stick_ends, follow, last_loop, loop_of
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates, saddles
-from ..model.modes import STUCK, edges, mode_acceleration, mode_of, select
+from ..model.modes import STUCK, edges, mode_acceleration, mode_of, select, velocity_of
 from ..model.oscillator import Oscillator
 from ..motion.arcs import Ends
 from ..motion.integrators import STRIDE
 from ..numerics.compiling import each, jit
 from ..results import Status
-from .systems import third_derivative, velocity_of
+from .systems import third_derivative
 
 #: Arcs for which the orbit from slip onset is followed in search of the signature. Of 665 such
 #: orbits (300 oscillators, half of them of round numbers) 84% repeated by then, 87% after 96.

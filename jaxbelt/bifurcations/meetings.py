@@ -26,7 +26,7 @@ from jaxtyping import Array
 from ..checks import is_concrete, pick, require_value
 from ..cycles.chains import SIZES, Chain, Loop, after_each, first_failure
 from ..cycles.shooting import meshed
-from ..model.modes import Mode, any_of, capacity, edges, mode_acceleration
+from ..model.modes import Mode, any_of, capacity, edge_at, edges, mode_acceleration
 from ..model.oscillator import Oscillator
 from ..model.transitions import contact
 from ..results import Status
@@ -174,7 +174,7 @@ class EdgesAtRest(RestSystem):
         return self.pair.gap(osc)[None]
 
     def x1(self, osc, x):
-        return jnp.stack(edges(osc))[self.pair.first]
+        return edge_at(osc, self.pair.first)
 
     def exists(self, osc, x):
         """Whether the mass can rest on, or between, them in either order."""

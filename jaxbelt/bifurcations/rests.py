@@ -34,10 +34,12 @@ from ..model.modes import (
     STUCK,
     boundary_guards,
     capacity,
+    edge_at,
     edge_guards,
     edges,
     mode_acceleration,
     mode_of,
+    velocity_of,
 )
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
@@ -50,7 +52,7 @@ from ..results import Status
 from .base import AbstractCondition, Line, point_without_cycle
 from .guesses import HINT_BUDGET, orbit_after_stick
 from .special import SpecialPoint, Trail
-from .systems import RestSystem, judged_by, small_newton, third_derivative, velocity_of
+from .systems import RestSystem, judged_by, small_newton, third_derivative
 
 #: The unknowns of a state of rest of which all is known.
 NOTHING = np.zeros(0)
@@ -369,7 +371,7 @@ class RestingBelt(RestSystem):
         mode = mode_of(self.codes)
         limit = self.side * capacity(osc, mode)
         needed = mode_acceleration(osc, mode, x[0], jnp.zeros(()))
-        away = x[0] - jnp.stack(edges(osc))[self.edge]
+        away = x[0] - edge_at(osc, self.edge)
         rests = jnp.where(self.edge < 0, needed + limit, away)
         return jnp.stack([rests, velocity_of(osc, self.belt)])
 

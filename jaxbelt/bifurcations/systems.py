@@ -98,11 +98,6 @@ class AbstractSystem(eqx.Module):
         """The same system with new integration steps, where there are any."""
 
 
-def velocity_of(osc: Oscillator, belt: int | Array) -> Array:
-    """The velocity of a belt, by its number."""
-    return jnp.stack([one.velocity for one in osc.belts])[belt]
-
-
 def velocity_tests(osc: Oscillator) -> Tests:
     """The velocities of the belts and their differences, which are watched on every curve."""
     velocities = [belt.velocity for belt in osc.belts]

@@ -28,7 +28,7 @@ from ..cycles.closure import admissible
 from ..cycles.orbits import Orbit, follow, last_loop, loop_of
 from ..cycles.shooting import meshed, trace_of
 from ..model.families import Family
-from ..model.modes import STUCK, mode_acceleration, mode_of, select
+from ..model.modes import STUCK, mode_acceleration, mode_of, select, velocity_of
 from ..model.oscillator import Oscillator
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
@@ -45,7 +45,6 @@ from .systems import (
     nearest_contacts,
     nearest_edge,
     stick_phase_from,
-    velocity_of,
 )
 
 #: Distance from an equilibrium at which its unstable manifold begins to be followed: the error is
@@ -315,7 +314,7 @@ def _tangent_departure(family: Family, codes, resting, touched, guess: Array):
     orbit = follow(osc, start, HINT_BUDGET)
     names = Ends(len(osc.belts))
     exits = orbit.exits
-    side = jnp.sign(jnp.stack([belt.velocity for belt in osc.belts])[touched])
+    side = jnp.sign(velocity_of(osc, touched))
     loops = (orbit.ends == names.extremum_x2) & (exits[:, 1] * side > 0)
     meets = (loops | (orbit.ends == touched)) & (jnp.arange(HINT_BUDGET) < orbit.count)
     last = jnp.argmax(meets)

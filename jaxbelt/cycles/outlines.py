@@ -26,6 +26,7 @@ from ..model.modes import (
     force_rounding,
     mode_acceleration,
     mode_of,
+    velocity_of,
     zone_ends,
 )
 from ..model.oscillator import Oscillator
@@ -139,7 +140,7 @@ def jumps(osc: Oscillator, belt: Array) -> tuple[Array, Array, Array]:
         The least and the largest x1 of each, [2 * zones], of all zones first of those to the left,
         NaN where there is none; and x2 of the boundary.
     """
-    v = jnp.stack([one.velocity for one in osc.belts])[belt] / osc.omega
+    v = velocity_of(osc, belt) / osc.omega
     low, high = zone_ends(osc)
     stuck = contact(osc, low, v, rightward=True)
     slips = Mode(tuple(jnp.where(code == STUCK, 1.0, code) for code in stuck.codes))

@@ -48,6 +48,7 @@ from ..model.modes import (
     mode_acceleration,
     mode_of,
     select,
+    velocity_of,
     zone_ends,
 )
 from ..model.oscillator import Oscillator
@@ -241,7 +242,7 @@ def tangencies(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
     modes of these orbits, [zones, belts]. x2'' = -x2 there, so they are orbits that slip with the
     sign of the belt's velocity.
     """
-    v = jnp.stack([one.velocity for one in osc.belts])[belt] / osc.omega
+    v = velocity_of(osc, belt) / osc.omega
     lower, upper = zone_ends(osc)
     stuck = contact(osc, lower, v, rightward=True)
     slips = Mode(tuple(jnp.where(code == STUCK, jnp.sign(v), code) for code in stuck.codes))
@@ -264,7 +265,7 @@ def corners(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
     orbits that come to them, [zones, belts]. On one side of such an orbit the mass is held, on the
     other it slips away.
     """
-    v = jnp.stack([one.velocity for one in osc.belts])[belt] / osc.omega
+    v = velocity_of(osc, belt) / osc.omega
     lower, upper = zone_ends(osc)
     x1 = jnp.where(v > 0, lower, upper)
     inside, before = (_beside(osc, x1, v, rightward=side) for side in (v > 0, v < 0))

@@ -276,6 +276,16 @@ def edges(osc: Oscillator) -> list[Array]:
     return [jnp.asarray(float(x)) if isinstance(x, NoEdge) else x for x in bounds]
 
 
+def edge_at(osc: Oscillator, number: int | Array) -> Array:
+    """The place of the edge of that number in `edges`."""
+    return jnp.stack(edges(osc))[number]
+
+
+def velocity_of(osc: Oscillator, belt: int | Array) -> Array:
+    """The velocity of a belt, by its number."""
+    return jnp.stack([one.velocity for one in osc.belts])[belt]
+
+
 def zone_ends(osc: Oscillator) -> tuple[Array, Array]:
     """Lower and upper ends of the intervals of x1 between contact edges, from left to right."""
     positions, end = jnp.sort(jnp.stack(edges(osc))), jnp.full(1, jnp.inf)
