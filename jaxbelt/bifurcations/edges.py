@@ -11,7 +11,6 @@ Grazing and corner collision are the names of M. di Bernardo, C. Budd, A. Champn
 Piecewise-smooth Dynamical Systems, 2008.
 """
 
-import abc
 from typing import ClassVar
 
 import equinox as eqx
@@ -107,10 +106,7 @@ class AbstractEdgeTouch(AbstractCycleCondition):
 
     has_several: ClassVar[bool] = True
 
-    @property
-    @abc.abstractmethod
-    def wanted(self) -> float | Array:
-        """The second event: see the class."""
+    wanted: eqx.AbstractVar[float | Array]
 
     @property
     def repels(self) -> bool:
@@ -189,13 +185,9 @@ class AbstractEdgeTouch(AbstractCycleCondition):
 class EdgeTouch(AbstractEdgeTouch):
     """Such an end with either second event, as data for programs."""
 
-    meant: float | Array = 0.0
+    wanted: float | Array = 0.0
     least: float | Array = -1.0
     unstable: bool = eqx.field(static=True, default=False)
-
-    @property
-    def wanted(self):
-        return self.meant
 
     @property
     def farther(self):
@@ -222,9 +214,7 @@ class GrazingEdge(AbstractEdgeTouch):
     caption: ClassVar[str] = "edge grazing, belt {belt}"
     line: ClassVar[Line] = Line("edge grazing", "#56B4E9")
 
-    @property
-    def wanted(self):
-        return 1.0
+    wanted = 1.0
 
     @property
     def repels(self):
@@ -260,9 +250,7 @@ class CornerCollision(AbstractEdgeTouch):
     caption: ClassVar[str] = "corner, belt {belt}"
     line: ClassVar[Line] = Line("corner", "#56B4E9", (0, (3, 1, 1, 1)))
 
-    @property
-    def wanted(self):
-        return -1.0
+    wanted = -1.0
 
     def limit(self, trail):
         """The point where the cycle shrinks to a pseudo-focus with the velocity of the

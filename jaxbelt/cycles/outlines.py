@@ -21,7 +21,6 @@ from ..model.equilibria import equilibria
 from ..model.modes import (
     ABOVE,
     STUCK,
-    Mode,
     capacity,
     force_rounding,
     mode_acceleration,
@@ -143,7 +142,7 @@ def jumps(osc: Oscillator, belt: Array) -> tuple[Array, Array, Array]:
     v = velocity_of(osc, belt) / osc.omega
     low, high = zone_ends(osc)
     stuck = contact(osc, low, v, rightward=True)
-    slips = Mode(tuple(jnp.where(code == STUCK, 1.0, code) for code in stuck.codes))
+    slips = stuck.slipping(1.0)
     zero = jnp.zeros_like(low)
     middle = mode_acceleration(osc, stuck, zero, v)
     kinetic = jnp.abs(mode_acceleration(osc, slips, zero, v) - middle)

@@ -65,6 +65,10 @@ class Mode(eqx.Module):
             for code, touches in zip(self.codes, self.touching, strict=True)
         )
 
+    def slipping(self, sign: float | Array) -> "Mode":
+        """The mode in which the belts that are stuck slip with a sign."""
+        return Mode(tuple(jnp.where(code == STUCK, sign, code) for code in self.codes))
+
 
 def any_of(flags: Sequence[Any]) -> Any:
     """Elementwise `or` of at least one array of booleans, of JAX or of NumPy."""
