@@ -11,6 +11,7 @@ Grazing and corner collision are the names of M. di Bernardo, C. Budd, A. Champn
 Piecewise-smooth Dynamical Systems, 2008.
 """
 
+import abc
 from typing import ClassVar
 
 import equinox as eqx
@@ -106,7 +107,10 @@ class AbstractEdgeTouch(AbstractCycleCondition):
 
     has_several: ClassVar[bool] = True
 
-    wanted: eqx.AbstractVar[float | Array]
+    @property
+    @abc.abstractmethod
+    def wanted(self) -> float | Array:
+        """The second event: see the class."""
 
     @property
     def repels(self) -> bool:
@@ -185,9 +189,13 @@ class AbstractEdgeTouch(AbstractCycleCondition):
 class EdgeTouch(AbstractEdgeTouch):
     """Such an end with either second event, as data for programs."""
 
-    wanted: float | Array = 0.0
+    meant: float | Array = 0.0
     least: float | Array = -1.0
     unstable: bool = eqx.field(static=True, default=False)
+
+    @property
+    def wanted(self):
+        return self.meant
 
     @property
     def farther(self):
@@ -214,7 +222,9 @@ class GrazingEdge(AbstractEdgeTouch):
     caption: ClassVar[str] = "edge grazing, belt {belt}"
     line: ClassVar[Line] = Line("edge grazing", "#56B4E9")
 
-    wanted = 1.0
+    @property
+    def wanted(self):
+        return 1.0
 
     @property
     def repels(self):
@@ -250,7 +260,9 @@ class CornerCollision(AbstractEdgeTouch):
     caption: ClassVar[str] = "corner, belt {belt}"
     line: ClassVar[Line] = Line("corner", "#56B4E9", (0, (3, 1, 1, 1)))
 
-    wanted = -1.0
+    @property
+    def wanted(self):
+        return -1.0
 
     def limit(self, trail):
         """The point where the cycle shrinks to a pseudo-focus with the velocity of the

@@ -161,7 +161,7 @@ class RestSystem(AbstractSystem):
 class AbstractChainSystem(AbstractSystem):
     """A fixed signature and a condition; the unknowns are those of the arcs, [N, 3] or [N, 4]."""
 
-    chain: eqx.AbstractVar[Chain]
+    chain: eqx.AbstractVar[Any]
 
     @abc.abstractmethod
     def error_of_steps(self, osc: Oscillator, x: Array) -> Array:
@@ -173,7 +173,7 @@ class AbstractChainSystem(AbstractSystem):
     def weights(self, x):
         return WEIGHT / (1 + jnp.abs(x.reshape(-1)))
 
-    def refined(self, osc: Oscillator, x: Array) -> "AbstractChainSystem":
+    def refined(self, osc: Oscillator, x: Array) -> Any:
         """The same system with shorter integration steps on arcs that need them.
 
         The error of the steps in the equations at x decides; steps of length zero pad the other

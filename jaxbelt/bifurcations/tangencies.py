@@ -14,6 +14,7 @@ The paper's cycles end with a nonsmooth fold (its section 3); grazing-sliding is
 Bernardo, C. Budd, A. Champneys, P. Kowalczyk, Piecewise-smooth Dynamical Systems, 2008.
 """
 
+import abc
 from typing import ClassVar
 
 import equinox as eqx
@@ -112,7 +113,10 @@ class AbstractTangency(AbstractStickCondition):
     more_arcs: ClassVar[int] = 1
     bends: ClassVar[bool] = True
 
-    wanted: eqx.AbstractVar[float | Array]
+    @property
+    @abc.abstractmethod
+    def wanted(self) -> float | Array:
+        """The kind to solve for: see the class."""
 
     @property
     def sought(self):
@@ -182,7 +186,11 @@ class AbstractTangency(AbstractStickCondition):
 class Tangency(AbstractTangency):
     """A tangency of either kind, as data for programs."""
 
-    wanted: float | Array = 0.0
+    meant: float | Array = 0.0
+
+    @property
+    def wanted(self):
+        return self.meant
 
 
 class NonsmoothFold(AbstractTangency):
@@ -195,7 +203,9 @@ class NonsmoothFold(AbstractTangency):
     caption: ClassVar[str] = "nonsmooth fold, belt {belt}"
     line: ClassVar[Line] = Line("nonsmooth fold", "black")
 
-    wanted = 1.0
+    @property
+    def wanted(self):
+        return 1.0
 
 
 class GrazingSliding(AbstractTangency):
@@ -208,7 +218,9 @@ class GrazingSliding(AbstractTangency):
     caption: ClassVar[str] = "grazing, belt {belt}"
     line: ClassVar[Line] = Line("grazing", "#CC79A7")
 
-    wanted = -1.0
+    @property
+    def wanted(self):
+        return -1.0
 
     def with_clock(self):
         return TimedGrazing(int(self.belt), type(self))

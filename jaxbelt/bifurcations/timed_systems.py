@@ -38,8 +38,6 @@ ON_CIRCLE = 1e-6
 class TimedSystem(AbstractChainSystem):
     """A condition on a periodic motion; the unknowns are those of the motion, [N, 4]."""
 
-    chain: eqx.AbstractVar[TimedChain]
-
     def condition(self, osc: Oscillator, z: Array) -> Array:
         """What vanishes there."""
         raise NotImplementedError

@@ -59,7 +59,7 @@ class Chain(eqx.Module):
         """The loop with these unknowns, [arcs, parts of the state and 1]."""
         return Loop(self.codes, self.ends, z[:, :-1], z[:, -1])
 
-    def on_both_meshes(self, value: Callable[["Chain"], Any]) -> Any:
+    def on_both_meshes(self, value: Callable[[Any], Any]) -> Any:
         """value(chain) with its integration steps as they are, and with all of them halved."""
         # Padded by steps of length zero to one shape.
         as_it_is = jnp.concatenate([self.mesh, jnp.zeros_like(self.mesh)], axis=1)

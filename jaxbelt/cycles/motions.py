@@ -1,6 +1,7 @@
 """What cycles and periodic motions of forced oscillators have in common: `ClosedMotion`."""
 
 import functools
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -26,7 +27,7 @@ class ClosedMotion(eqx.Module):
     """
 
     oscillator: eqx.AbstractVar[Oscillator]
-    chain: eqx.AbstractVar[Chain]
+    chain: eqx.AbstractVar[Any]
     unknowns: eqx.AbstractVar[Array]
     status: eqx.AbstractVar[Array]
 
