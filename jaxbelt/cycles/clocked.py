@@ -31,8 +31,8 @@ from ..model.oscillator import Oscillator, at_time, frequencies
 from ..motion.arcs import Ends
 from ..motion.integrators import density
 from ..numerics.compiling import any_lane, jit, power_of_two
-from ..numerics.implicit import Equations, solution, step_to_root
-from ..numerics.newton import HOLDS, Newton, solve
+from ..numerics.implicit import Equations, step_to_root
+from ..numerics.newton import HOLDS
 from .chains import Chain, Loop, following_codes
 from .shooting import (
     ARC_STEPS,
@@ -226,16 +226,6 @@ class TimedClosed(Equations):
         _, blocks = timed_blocks(given, along, self.chain, z)
         change = _timed_mismatch(blocks[..., 4:] @ weights, jnp.zeros_like(z))
         return change.reshape(-1), jacobian(blocks[..., :4])
-
-
-def solve_timed(osc: Oscillator, chain: TimedChain, guess: Array) -> Newton:
-    """The unknowns of a chain near a guess, differentiable with respect to the oscillator."""
-    return solve(TimedClosed(chain), osc, lax.stop_gradient(guess))
-
-
-def timed_solution(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
-    """The unknowns z, which `solve_timed` has found, differentiable by the oscillator."""
-    return solution(TimedClosed(chain), osc, lax.stop_gradient(z))
 
 
 # --- the monodromy matrix -------------------------------------------------------------------------

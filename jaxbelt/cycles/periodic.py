@@ -29,23 +29,23 @@ from ..model.oscillator import Oscillator, check_clock, check_oscillator
 from ..model.own_units import in_given_units, in_own_units, quantity
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
-from ..numerics.newton import HOLDS
+from ..numerics.implicit import solution
+from ..numerics.newton import HOLDS, solve
 from ..results import Status, describe, draw
 from ..tables import per_belt, require_single, table_of
 from .chains import SIZES, Loop, blank_loop, first_failure
 from .clocked import (
     TimedChain,
+    TimedClosed,
     extrema_along,
     forcing_period,
     least_steps,
     monodromy,
     multipliers_of,
-    solve_timed,
     sticks_in,
     timed_admissible,
     timed_chain,
     timed_residual,
-    timed_solution,
     turns_of,
 )
 from .followed import PERIODS_AT_ONCE, Followed, after_period, arcs_over
@@ -244,7 +244,7 @@ def _polished_motion(
 ) -> tuple[PeriodicMotion, Array]:
     """The motion near a guess of a chain's unknowns, and the error that its steps leave; with more
     than `most` of it there is none."""
-    solved = solve_timed(osc, chain, guess)
+    solved = solve(TimedClosed(chain), osc, guess)
     z, settled = solved.z, solved.unsettled
     still, at = lax.stop_gradient((osc, z))
     values = chain.on_both_meshes(lambda one: timed_residual(still, one, at))
@@ -276,7 +276,7 @@ def _motion(osc, chain, z, residual, iterations, status) -> PeriodicMotion:
 def _motion_with_derivatives(osc: Oscillator, motion: PeriodicMotion) -> PeriodicMotion:
     """A motion that is known, as one of an oscillator by which it can be differentiated."""
     chain, status = motion.chain, motion.status
-    z = timed_solution(osc, chain, motion.unknowns)
+    z = solution(TimedClosed(chain), osc, lax.stop_gradient(motion.unknowns))
     return _motion(osc, chain, z, motion.residual, motion.iterations, status)
 
 
