@@ -43,7 +43,7 @@ from ..cycles.periodic import (
     nothing_found,
     periodic_from,
 )
-from ..model.instants import guards_at, trend_of
+from ..model.instants import guards_trend
 from ..model.modes import STUCK, mode_of
 from ..model.oscillator import Oscillator, check_clock
 from ..model.own_units import OwnOscillator, in_own_units, rescaled
@@ -404,9 +404,10 @@ class _AtArrival(AbstractForcedCondition):
 def _excess(osc: Oscillator, codes: Array, y: Array) -> tuple[Array, Array]:
     """By how much the force that is needed exceeds what the stuck belts hold, and its rate."""
     mode = mode_of(codes)
-    at = trend_of(osc, mode, lambda y: guards_at(osc, mode, y)[-2:], (y[0], y[1], y[2]))
-    nearest = jnp.argmin(at.value)
-    return -at.value[nearest], -at.slope[nearest]
+    at = guards_trend(osc, mode, y)
+    value, slope = at.value[-2:], at.slope[-2:]
+    nearest = jnp.argmin(value)
+    return -value[nearest], -slope[nearest]
 
 
 class TimedCrossing(_AtArrival):

@@ -25,7 +25,7 @@ from ..cycles.periodic import (
     motion_at,
 )
 from ..cycles.shooting import jacobian
-from ..model.instants import guards_at, trend_of
+from ..model.instants import guards_trend
 from ..model.modes import capacity, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator, at_time
 from ..results import Status
@@ -152,13 +152,8 @@ class AtLimit(TimedSystem):
 
     def judge(self, osc, motion):
         mode, y = mode_of(self.codes), motion.unknowns[self.row + 1]
-
-        def guards(y):
-            return guards_at(osc, mode, y)
-
-        limits = trend_of(osc, mode, guards, (y[0], y[1], y[2])).slope[-2:]
-        values = guards((y[0], y[1], y[2]))[-2:]
-        rises = -jnp.where(values[0] < values[1], limits[0], limits[1])
+        at = guards_trend(osc, mode, y)
+        rises = -jnp.where(at.value[-2] < at.value[-1], at.slope[-2], at.slope[-1])
         return first_failure(motion.status, self.rises * rises >= 0, Status.OTHER_KIND)
 
 

@@ -25,7 +25,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..checks import require
-from ..model.instants import carried, guards_at, trend_of
+from ..model.instants import carried, guards_at, guards_trend, trend_of
 from ..model.modes import capacity, mode_acceleration, mode_of, select
 from ..model.oscillator import Oscillator, at_time, frequencies
 from ..motion.arcs import Ends
@@ -353,7 +353,7 @@ def guards_along(osc: Oscillator, chain: TimedChain, z: Array) -> tuple[Array, A
         mode = mode_of(codes)
 
         def at(y):
-            found = trend_of(osc, mode, lambda y: guards_at(osc, mode, y), (y[0], y[1], y[2]))
+            found = guards_trend(osc, mode, y)
             return found.value, found.slope
 
         states = states_along(osc, codes, mesh, unknown[:3], unknown[3])
@@ -466,7 +466,7 @@ def _least(
 def _guard_slope(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
     """How fast the guard that ends an arc rises there; 0 of arcs that end otherwise."""
     mode, names = mode_of(codes), Ends(len(osc.belts))
-    at = trend_of(osc, mode, lambda y: guards_at(osc, mode, y), (y[0], y[1], y[2]))
+    at = guards_trend(osc, mode, y)
     count = at.value.size - 2
     limit = count + jnp.argmin(at.value[count:])
     place = jnp.where(end == names.onset, limit, jnp.clip(end, 0, count - 1))

@@ -121,6 +121,11 @@ def trend_of(
     return Trend(value, slope, curvature)
 
 
+def guards_trend(osc: Oscillator, mode: Mode, y: TimedState | Array) -> Trend:
+    """The guards of a mode, and how they change in its motion, at a state, also in an array [3]."""
+    return trend_of(osc, mode, lambda y: guards_at(osc, mode, y), (y[0], y[1], y[2]))
+
+
 def guard_sizes(osc: Oscillator, y: TimedState) -> Array:
     """The size of the numbers of which guards are made, with what the time adds to rounding."""
     x1, x2, t = y
