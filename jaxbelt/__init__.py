@@ -14,7 +14,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     checks          arguments, checked at the public edge
     tables          results as tables
     numerics/       padding derivatives implicit extrapolation newton continuation
-    numerics/       roots control_points
+    numerics/       roots polynomials control_points
     model/          friction forcing oscillator own_units machine parameters families
     model/          variations modes pseudofocus transitions instants rest events equilibria
     model/          far_out

@@ -33,6 +33,7 @@ from ..motion.integrators import density
 from ..numerics.compiling import any_lane, jit, power_of_two
 from ..numerics.implicit import Equations, step_to_root
 from ..numerics.newton import HOLDS
+from ..numerics.polynomials import derivative, polynomial, quintic
 from .chains import Chain, Loop, following_codes
 from .shooting import (
     ARC_STEPS,
@@ -383,29 +384,21 @@ def _least_between(
     there = jnp.isfinite(at.value)
     h = jnp.diff(states[:, 2])[:, None]
     value, slope, curvature = (jnp.where(there, one, 0.0) for one in at)
-    f, d, c = value, slope[:-1] * h, curvature[:-1] * h**2
-    rise = f[1:] - f[:-1] - d - 0.5 * c
-    steeper, bent = slope[1:] * h - d - c, curvature[1:] * h**2 - c
-    powers = [f[:-1], d, 0.5 * c, 10 * rise - 4 * steeper + 0.5 * bent]
-    powers += [-15 * rise + 7 * steeper - bent, 6 * rise - 3 * steeper + 0.5 * bent]
-
-    def quintic(s):
-        return functools.reduce(lambda total, p: total * s + p, reversed(powers))
-
+    start, end = (
+        (value[part], slope[part] * h, curvature[part] * h**2)
+        for part in (slice(None, -1), slice(1, None))
+    )
+    between = quintic(start, end)
+    slopes = derivative(between)
+    bends = derivative(slopes)
     places = jnp.linspace(0.0, 1.0, 9)
-    values = jnp.stack([quintic(s) for s in places])
+    values = jnp.stack([polynomial(between, s) for s in places])
     s = places[jnp.argmin(values, axis=0)]
     for _ in range(4):
-        first, second = _derivatives(powers, s)
-        s = jnp.clip(s - first / jnp.where(second > 0, second, jnp.inf), 0.0, 1.0)
-    least = jnp.minimum(jnp.min(values, axis=0), quintic(s))
+        first, second = polynomial(slopes, s), polynomial(bends, s)
+        s = jnp.clip(s + step_to_root(first, second, where=second > 0), 0.0, 1.0)
+    least = jnp.minimum(jnp.min(values, axis=0), polynomial(between, s))
     return jnp.where(there[:-1], least, jnp.inf), s
-
-
-def _derivatives(powers: list[Array], s: Array) -> tuple[Array, Array]:
-    first = sum(k * p * s ** (k - 1) for k, p in enumerate(powers) if k)
-    second = sum(k * (k - 1) * p * s ** (k - 2) for k, p in enumerate(powers) if k > 1)
-    return jnp.asarray(first), jnp.asarray(second)
 
 
 #: What is least where x1, and x2, is smallest or largest.
