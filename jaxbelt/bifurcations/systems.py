@@ -27,6 +27,7 @@ from ..cycles.shooting import jacobian, meshed, residual, residual_and_blocks
 from ..model.families import Family
 from ..model.modes import capacity, edge_guards, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
+from ..model.pseudofocus import derivatives_at_rest
 from ..motion.arcs import Ends
 from ..numerics.implicit import Equations, solution
 from ..numerics.newton import HOLDS, STEP_ROUNDING, is_settled, newton, solve
@@ -188,15 +189,8 @@ class AbstractChainSystem(AbstractSystem):
 
 
 def third_derivative(osc: Oscillator, codes: Array, x1: Array) -> Array:
-    """Third derivative of x2' by x2 at a fixed point: 16 times the first Lyapunov coefficient."""
-
-    def derivative(fn):
-        return lambda x2: jax.jvp(fn, (x2,), (jnp.ones_like(x2),))[1]
-
-    def acceleration(x2):
-        return mode_acceleration(osc, mode_of(codes), x1, x2)
-
-    return derivative(derivative(derivative(acceleration)))(jnp.zeros(()))
+    """The third derivative of x2' by x2 at a fixed point."""
+    return derivatives_at_rest(osc, mode_of(codes), x1)[3]
 
 
 class CycleSystem(AbstractChainSystem):
