@@ -26,10 +26,11 @@ from jaxtyping import Array
 from ..cycles.chains import SIZES, Chain, Loop, first_failure
 from ..cycles.closure import admissible
 from ..cycles.orbits import Orbit, follow, last_loop, loop_of
-from ..cycles.shooting import meshed, trace_of
+from ..cycles.shooting import meshed
 from ..model.families import Family
 from ..model.modes import STUCK, mode_acceleration, mode_of, select, velocity_of
 from ..model.oscillator import Oscillator
+from ..model.pseudofocus import derivatives_at_rest
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS, newton
@@ -365,7 +366,7 @@ def _departure(osc: Oscillator, codes: Array, belt: Array) -> Array:
     """
     mode, zero = mode_of(codes), jnp.zeros(())
     rest = mode_acceleration(osc, mode, zero, zero)
-    trace, twice_bend = jax.jvp(lambda x2: trace_of(osc, mode, rest, x2)[0], (zero,), (zero + 1,))
+    _, trace, twice_bend, _ = derivatives_at_rest(osc, mode, rest)
     strong = 0.5 * trace + jnp.sqrt(0.25 * trace**2 - 1)
     weak = 1 / strong
     x2 = -codes[belt] * DEPARTURE
