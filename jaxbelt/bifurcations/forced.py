@@ -27,14 +27,13 @@ from jax import lax
 from jaxtyping import Array
 
 from ..checks import as_array, check_finite, is_concrete, require
-from ..cycles.chains import Loop
+from ..cycles.chains import Loop, padded_loop
 from ..cycles.clocked import (
     guards_along,
     least_steps,
     timed_chain,
     turns_of,
 )
-from ..cycles.followed import Followed
 from ..cycles.periodic import (
     PeriodicMotion,
     attracted,
@@ -118,8 +117,7 @@ class ArcRows(NamedTuple):
         return self.put(row - 1, row + 1, first, second)
 
     def loop(self) -> Loop:
-        empty = np.zeros((0, 2))
-        return Followed(self.codes, self.ends, self.z[:, :3], self.z[:, 3], empty, 0).loop()
+        return padded_loop(self.codes, self.ends, self.z[:, :3], self.z[:, 3])
 
 
 class Beginning(NamedTuple):

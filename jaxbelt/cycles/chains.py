@@ -18,6 +18,7 @@ from jaxtyping import Array
 from ..model.events import Signature, events_of
 from ..model.own_units import quantity
 from ..motion.arcs import Ends
+from ..numerics.compiling import power_of_two
 from ..results import Status
 
 #: Sizes of chains: the number of arcs is rounded up to one of these; the first one under a trace.
@@ -93,6 +94,22 @@ def blank_loop(size: int, belts: int) -> Loop:
     unused = np.full(size, Ends(belts).unused)
     arrays = np.ones((size, belts)), unused, np.zeros((size, 2)), np.zeros(size)
     return Loop(*map(jnp.asarray, arrays))
+
+
+def padded_loop(
+    codes: np.ndarray, ends: np.ndarray, entries: np.ndarray, durations: np.ndarray
+) -> Loop:
+    """Known arcs as a loop, padded to one of `SIZES`, or to a power of two."""
+    count = len(ends)
+    size = next((one for one in SIZES if one >= count), power_of_two(count, SIZES[-1]))
+    more = size - count
+    return Loop(
+        codes=jnp.asarray(np.pad(codes, [(0, more), (0, 0)], constant_values=1.0)),
+        ends=jnp.asarray(np.pad(ends, (0, more), constant_values=Ends(codes.shape[-1]).unused)),
+        # After the last used arc comes the first one.
+        entries=jnp.asarray(np.concatenate([entries, entries[[0] * more]])),
+        durations=jnp.asarray(np.pad(durations, (0, more))),
+    )
 
 
 def modes_of(loop: Chain | Loop) -> np.ndarray:

@@ -10,8 +10,7 @@ from ..model.modes import BELOW, mode_of, stick_velocity
 from ..model.oscillator import Oscillator, at_time
 from ..motion.arcs import Ends
 from ..motion.simulate import simulate
-from ..numerics.compiling import power_of_two
-from .chains import SIZES, Loop
+from .chains import Loop, padded_loop
 from .clocked import forcing_period
 
 #: Periods that are followed in one run, which are the most that a motion may have.
@@ -49,16 +48,7 @@ class Followed(NamedTuple):
 
     def loop(self) -> Loop:
         """As a loop, padded to a size of chains."""
-        n, count = self.codes.shape[-1], len(self.ends)
-        size = next((one for one in SIZES if one >= count), power_of_two(count, SIZES[-1]))
-        more = size - count
-        return Loop(
-            codes=jnp.asarray(np.pad(self.codes, [(0, more), (0, 0)], constant_values=1.0)),
-            ends=jnp.asarray(np.pad(self.ends, (0, more), constant_values=Ends(n).unused)),
-            # After the last used arc comes the first one.
-            entries=jnp.asarray(np.concatenate([self.entries, self.entries[[0] * more]])),
-            durations=jnp.asarray(np.pad(self.durations, (0, more))),
-        )
+        return padded_loop(self.codes, self.ends, self.entries, self.durations)
 
 
 def arcs_over(osc: Oscillator, y0: Any, turns: int) -> Followed:
