@@ -5,6 +5,9 @@ and its points at some moment (extrema, crossings of a section, events) are kept
 one as with `observe="attractor"`, so that each run takes the transient that it needs, and one that
 follows each cycle through one loop, from its largest displacement. The values of the parameter are
 data of both: other values compile nothing, and so a picture can be zoomed into.
+
+Where each value begins from what the one before has led to, as in an experiment, the first sweep is
+one value after the other, in a kernel of few lanes.
 """
 
 from collections import Counter
@@ -17,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from ..activity import announced
+from ..activity import announced, note_progress
 from ..checks import (
     as_array,
     as_interval,
@@ -26,6 +29,7 @@ from ..checks import (
     as_whole,
     check_finite,
     outside_of_traces,
+    require_one_of,
     require_value,
 )
 from ..cycles.attractors import RUN
@@ -36,7 +40,7 @@ from ..numerics.spacing import evenly_spaced
 from ..results import Status, draw
 from ..tables import table_of
 from .along import Along
-from .attractor import CYCLE, KINDS, UNDECIDED, Attractor
+from .attractor import CYCLE, EQUILIBRIUM, KINDS, UNDECIDED, Attractor
 from .grid import Grid
 from .moments import AtEvents, AtExtrema, AtPhase, AtSection
 from .question import LONG_ENOUGH
@@ -55,8 +59,16 @@ MOST_RUNS = 64
 #: A run through a loop goes on beyond it by this fraction of the period.
 OUTSIDE = 1e-4
 
-#: Of a forced oscillator: periods that are left out at first, and points that are kept.
-PERIODS_LEFT_OUT, STROBES = 1000, 64
+#: Of a forced oscillator: periods that are left out at first, fewer of them where a run begins on
+#: the attractor of a neighbouring value, and points that are kept.
+PERIODS_LEFT_OUT, PERIODS_LEFT_OUT_BESIDE, STROBES = 1000, 500, 64
+#: Lanes of a run that begins where another one has ended.
+FEW_LANES = 4
+#: Such a run begins so far from an equilibrium or a periodic forced motion, in own units: these may
+#: have become unstable, and a run that begins on one would stay.
+OFF_ATTRACTOR = 1e-3
+#: In which sense the parameter changes where runs begin so.
+SENSES = {"up": ("up",), "down": ("down",), "both": ("up", "down")}
 #: The kind of such points without a period: of chaos, of a torus, or of a slow approach.
 NOT_PERIODIC = "no period found"
 
@@ -159,6 +171,7 @@ def orbit_diagram(
     *,
     at: AtExtrema | AtSection | AtEvents | AtPhase | None = None,
     y0: ArrayLike | Sequence[Any] = (3.0, 0.0),
+    sense: str | None = None,
     rows: int = 400,
     rtol: ArrayLike = 1e-8,
     atol: ArrayLike | None = None,
@@ -179,6 +192,10 @@ def orbit_diagram(
             "x2", an `AtSection`, or `AtEvents`. Of a forced oscillator an `AtPhase` (None).
         y0: Start (x1, x2), or several, [starts, 2]: where attractors coexist, each start shows its
             own.
+        sense: "up", "down" or "both": the first value, or the last one, begins from `y0`, and each
+            other one from the attractor of the value before, as in an experiment in which the
+            parameter changes slowly; with "both", up is start 0 and down is start 1. None: each
+            value begins from `y0`.
         rows: Number of values of the parameter, evenly spaced.
         rtol: Relative tolerance of a step.
         atol: Absolute tolerance of a step; None: 1e-8 of the oscillator's own size.
@@ -196,6 +213,9 @@ def orbit_diagram(
     numbers = {"rtol": as_positive(rtol, "rtol"), "atol": as_tolerance(atol, "atol")}
     variation = varied(osc, where, (first,), forced=True)
     rows = as_whole(rows, "rows", 2)
+    if sense is not None:
+        require_one_of(sense, tuple(SENSES), "sense")
+        require_value(len(starts) == 1, "y0", "one start where sense is given", y0)
     example = variation.oscillator(np.array([first]))
     if has_clock(example):
         at = AtPhase() if at is None else at
@@ -205,7 +225,9 @@ def orbit_diagram(
         kinds = AtExtrema | AtSection | AtEvents
         require_value(isinstance(at, kinds), "at", "an AtExtrema, AtSection or AtEvents", at)
     check_sections((at,), example)
-    return Sampling(variation, at, starts, rows, numbers).diagram((first, last))
+    senses = () if sense is None else SENSES[sense]
+    starts = np.repeat(starts, len(senses), axis=0) if senses else starts
+    return Sampling(variation, at, starts, rows, numbers, senses).diagram((first, last))
 
 
 def _starts_of(y0: Any) -> np.ndarray:
@@ -223,13 +245,17 @@ def _starts_of(y0: Any) -> np.ndarray:
 @dataclass(frozen=True, eq=False)
 class Sampling:
     """Arguments that determine the points of an orbit diagram, except its span; see
-    `orbit_diagram`."""
+    `orbit_diagram`.
+
+    senses: in which sense the parameter changes, for each start; none: each value has the starts.
+    """
 
     variation: Variation
     at: Any
     starts: np.ndarray
     rows: int
     numbers: dict[str, Any]
+    senses: tuple[str, ...] = ()
 
     def diagram(self, span: tuple[float, float]) -> OrbitDiagram:
         """The orbit diagram over a span of the parameter."""
@@ -240,7 +266,7 @@ class Sampling:
         grid = Grid(self._make, {"parameter": values}, (0.0, 0.0))
         if isinstance(self.at, AtPhase):
             return self._strobed(grid, values)
-        found = self._results(grid, Attractor(), np.tile(self.starts.T, len(values)), LONG_ENOUGH)
+        found = self._from_starts(grid, Attractor(), _beside_attractor(grid), LONG_ENOUGH)
         # Codes of runs that are not finite are NaN.
         kind = np.nan_to_num(found["kind"]).astype(int)
         status = found["status"].astype(int)
@@ -279,10 +305,15 @@ class Sampling:
         """The diagram of a stroboscopic section: STROBES points behind PERIODS_LEFT_OUT periods."""
         first = [float(frequencies(self._make(value))[0]) for value in values]
         period = 2 * np.pi / np.repeat(first, len(self.starts))
-        t1 = float(np.max(period)) * (PERIODS_LEFT_OUT + STROBES + 1)
-        reducer = _KeptMoments((self.at,), STROBES, ("x1", "x2"), PERIODS_LEFT_OUT)
-        states = np.tile(self.starts.T, len(values))
-        found = self._results(grid, Along(reducer), states, t1, t0=0.0)
+        left_out = PERIODS_LEFT_OUT_BESIDE if self.senses else PERIODS_LEFT_OUT
+        t1 = float(np.max(period)) * (left_out + STROBES + 1)
+        reducer = _KeptMoments((self.at,), STROBES, ("x1", "x2"), left_out)
+        off = OFF_ATTRACTOR * grid.length()
+
+        def further(found):
+            return reducer.last_state(found) + off
+
+        found = self._from_starts(grid, Along(reducer), further, t1, t0=0.0)
         x1, x2 = reducer.columns(found)
         # Runs of other frequencies may have a period less.
         status = found["status"].astype(int)
@@ -306,12 +337,40 @@ class Sampling:
         states: np.ndarray,
         t1: float,
         which: Any = None,
-        t0: float | None = None,
+        **numbers: Any,
     ) -> dict[str, np.ndarray]:
-        """Results of an observer for runs from states, [2, runs]; which: their numbers, or all."""
+        """Results of an observer for runs from states, [2, runs]; which: their numbers, or all;
+        numbers: more of `threads.run`."""
         which = np.arange(states.shape[1]) if which is None else which
-        numbers = {"t1": t1, "t0": t0, **self.numbers}
+        numbers |= {"t1": t1, **self.numbers}
         return grid.results(observer, states, which // len(self.starts), **numbers)
+
+    def _from_starts(
+        self,
+        grid: Grid,
+        observer: Any,
+        further: Callable[[dict[str, np.ndarray]], np.ndarray],
+        t1: float,
+        **numbers: Any,
+    ) -> dict[str, np.ndarray]:
+        """Results of an observer for all runs. Where the parameter changes in some sense,
+        `further` says of results where the next value begins, [2, runs], NaN: where they did."""
+        if not self.senses:
+            states = np.tile(self.starts.T, self.rows)
+            return self._results(grid, observer, states, t1, **numbers)
+        lanes, found = np.arange(len(self.senses)), {}
+        states = self.starts.T
+        for i in range(self.rows):
+            note_progress(f"{i} of {self.rows} values")
+            row = [i if sense == "up" else self.rows - 1 - i for sense in self.senses]
+            which = np.array(row) * len(lanes) + lanes
+            few = {"width": FEW_LANES, **numbers}
+            for name, values in self._results(grid, observer, states, t1, which, **few).items():
+                shape = self.rows * len(lanes), *values.shape[1:]
+                found.setdefault(name, np.full(shape, np.nan))[which] = values
+            ahead = further({name: values[which] for name, values in found.items()})
+            states = np.where(np.isfinite(ahead), ahead, states)
+        return found
 
     def _loops(self, grid: Grid, which: np.ndarray, x1_min, x1_max, period):
         """Status, x1 and x2 of the moments of one loop of cycles, [cycles] and [cycles, points].
@@ -370,6 +429,20 @@ class Sampling:
         return moments, cut
 
 
+def _beside_attractor(grid: Grid) -> Callable[[dict[str, np.ndarray]], np.ndarray]:
+    """Gives a state on the attractor of each run, [2, runs], or beside it, by its results."""
+    off = OFF_ATTRACTOR * grid.length()
+
+    def state(found: dict[str, np.ndarray]) -> np.ndarray:
+        kind = np.nan_to_num(found["kind"]).astype(int)
+        is_cycle, rests = kind == CYCLE, kind == EQUILIBRIUM
+        x1 = np.where(is_cycle, found["x1_max"], found["x1_min"] + np.where(rests, off, 0.0))
+        state = np.stack([x1, np.where(is_cycle, 0.0, found["x2_min"])])
+        return np.where(kind == UNDECIDED, np.nan, state)
+
+    return state
+
+
 def _turns_in(x1: np.ndarray, x2: np.ndarray) -> np.ndarray:
     """After how many points rows of them repeat, all of them, half as many at most; 0: not."""
     turns = np.zeros(len(x1), dtype=int)
@@ -425,6 +498,13 @@ class _KeptMoments:
             for name, pieces in zip(self.kept, state[0], strict=True)
             for i, piece in enumerate(pieces)
         }
+
+    def last_state(self, found: dict[str, np.ndarray]) -> np.ndarray:
+        """The last (x1, x2) that was kept of runs, [2, runs], NaN where there is none."""
+        x1, x2 = self.columns(found)
+        known = np.isfinite(x1)
+        last = self.room - 1 - np.argmax(known[:, ::-1], axis=1)
+        return np.stack([np.take_along_axis(x, last[:, None], 1)[:, 0] for x in (x1, x2)])
 
     def columns(self, found: dict[str, np.ndarray]) -> list[np.ndarray]:
         """What was kept of runs, [runs, room] each, from their results."""

@@ -20,22 +20,17 @@ def results_of(
     shared: list[Array],
     rows_of: Callable[[int, int], np.ndarray],
     runs: int,
-    *,
-    t1: float,
-    rtol: float,
-    atol: float | None,
-    t0: float | None = None,
-    budget: float = 1.0,
+    **numbers: Any,
 ) -> dict[str, np.ndarray]:
     """Results of runs by name, [runs, ...], in the order of the runs; arguments as for
-    `threads.run`."""
+    `threads.run`; numbers: t1, rtol, atol, and more of its numbers."""
     shapes = layout(program, shared)
     columns = np.zeros((sum(math.prod(shape) for shape in shapes.values()), runs))
 
     def put(places: np.ndarray, results: np.ndarray) -> None:
         columns[:, places] = results[0]
 
-    run(program, shared, rows_of, runs, put, t1=t1, rtol=rtol, atol=atol, t0=t0, budget=budget)
+    run(program, shared, rows_of, runs, put, **numbers)
     return by_name(shapes, columns)
 
 
