@@ -13,25 +13,27 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     numerics/       spacing widths programs compiling
     checks          arguments, checked at the public edge
     tables          results as tables
-    numerics/       padding derivatives extrapolation newton continuation roots
-    numerics/       control_points
-    model/          friction forcing oscillator own_units machine parameters variations modes
-    model/          pseudofocus transitions instants rest events equilibria far_out
+    numerics/       padding derivatives implicit extrapolation newton continuation
+    numerics/       roots polynomials control_points
+    model/          friction forcing oscillator own_units machine parameters families
+    model/          variations modes pseudofocus transitions instants rest events equilibria
+    model/          far_out
     presets         the published systems
     kernel/         lanes marks step events rounds waves clocked
     motion/         integrators arcs flights sensitivities sampling loops batches timed runs
     motion/         smoothing simulate
-    cycles/         chains settling shooting clocked periodic exponents orbits cycle
-    cycles/         attractors functionals
-    cycles/         backwards returns separatrices portrait unstable
-    cycles/         outlines nearest sides shocks
-    sweeps/         observers moments along reducers attractor strobes queue threads audit
-    sweeps/         grid datasets question locks store progress work clusters sweep shares
+    cycles/         chains settling shooting motions closure clocked followed periodic exponents
+    cycles/         orbits cycle attractors functionals backwards returns separatrices portrait
+    cycles/         unstable outlines nearest sides shocks
+    sweeps/         observers moments along reducers attractor strobes queue threads
+    sweeps/         runs_in_memory audit grid datasets question locks store progress work
+    sweeps/         clusters sweep shares
     sweeps/         naming forced_basins basins fractions orbit_diagram circle_map
-    bifurcations/   special labels beside systems guesses base conditions forced tangencies
-    bifurcations/   crossings rests edge_rests edges folds meetings connections infinity path scan
-    bifurcations/   refine tracks curves cells faces bounds regions branches diagrams switch_folds
-    inverse/        selection record search fit margins design
+    bifurcations/   special labels beside systems timed_systems guesses base conditions forced
+    bifurcations/   tangencies crossings rests edge_rests edges folds meetings connections
+    bifurcations/   infinity path scan refine tracks curves cells faces bounds regions branches
+    bifurcations/   pieces diagrams switch_folds
+    inverse/        selection record search windows fit margins design
     si              results in SI units
     plotting/       style phase histories forced points diagrams regions categories sweeps orbits
     plotting/       inverse model draw si explorer

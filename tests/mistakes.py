@@ -309,6 +309,11 @@ MISTAKES = [
     ("jb.orbit_diagram(osc, nu0, (0.1, 0.7), rows=1)", "rows must be an integer >= 2, got 1"),
     ("jb.orbit_diagram(osc, nu0, (0.1, 0.7), y0=3.0)", r"y0 must be of shape \(2\), got shape"),
     ("jb.orbit_diagram(osc, nu0, (0.1, 0.7), y0=[[1, 2, 3]])", r"y0 must be of shape \(n, 2\)"),
+    ("jb.orbit_diagram(osc, nu0, (0.1, 0.7), sense='rising')", "sense must be .*'rising'"),
+    (
+        "jb.orbit_diagram(osc, nu0, (0.1, 0.7), y0=[(3, 0), (1, 0)], sense='up')",
+        "y0 must be one start where sense is given",
+    ),
     ("jb.orbit_diagram(osc, nu0, (0.1, 0.7), atol=0)", r"atol must be > 0, got 0\.0"),
     ("jb.orbit_diagram(osc, lambda o: o.omega, (-1.0, 1.0))", r"omega must be > 0, got -1\.0"),
     ("jb.bifurcation_curve(osc, (nu0, nu1), PLANE)", POINT + r"Oscillator\("),

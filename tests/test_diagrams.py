@@ -12,9 +12,9 @@ import pytest
 import jaxbelt as jb
 from jaxbelt import EventKind
 from jaxbelt.bifurcations.cells import in_plane_of_paper, region_name
-from jaxbelt.bifurcations.diagrams import Branch
 from jaxbelt.bifurcations.faces import Faces
 from jaxbelt.bifurcations.labels import Label
+from jaxbelt.bifurcations.pieces import Branch
 from jaxbelt.bifurcations.regions import RegionMap
 from jaxbelt.plotting.diagrams import _between_rows
 

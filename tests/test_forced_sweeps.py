@@ -126,6 +126,22 @@ def test_moments_are_those_of_a_run_that_is_sampled(t0):
 
 
 @pytest.mark.slow(first=True)
+def test_both_attractors_as_the_frequency_rises_and_falls():
+    """The sticking motion of two periods ends in the fold at 1.68344; chaos is there below, too."""
+    make = jb.presets.di_bernardo
+    found = jb.orbit_diagram(make, span=(1.675, 1.695), y0=(0.5, 0.0), rows=5, sense="both")
+    up, down = found.kind.T
+    chaos = "no period found"
+    assert up.tolist() == ["cycle", "cycle", chaos, chaos, chaos]
+    assert down.tolist() == [chaos] * 5
+    periods = 2 * 2 * np.pi / found.values[:2]
+    assert found.period[:2, 0] == pytest.approx(periods, rel=1e-12)
+    motion = jb.find_cycle(make(1.68), (0.5, 0.0))
+    points = found.x1[1, 0][~np.isnan(found.x1[1, 0])]
+    assert np.sort(points) == pytest.approx(np.sort(np.asarray(motion.starts)[:, 0]), abs=1e-6)
+
+
+@pytest.mark.slow(first=True)
 def test_an_orbit_diagram_has_the_periods_of_find_cycle():
     diagram = jb.orbit_diagram(jb.presets.di_bernardo, span=(1.67, 1.75), y0=(0.5, 0.0), rows=9)
     for value, kind, period, x1 in zip(*(diagram.values, diagram.kind, diagram.period, diagram.x1)):

@@ -13,7 +13,7 @@ import xarray as xr
 from laws import Lorentz
 
 import jaxbelt as jb
-from jaxbelt.bifurcations.diagrams import Branch
+from jaxbelt.bifurcations.pieces import Branch
 from jaxbelt.model.parameters import names_of
 from jaxbelt.si import unit_of
 

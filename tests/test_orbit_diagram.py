@@ -160,6 +160,8 @@ def test_a_loop_with_more_moments_than_there_is_room_for(monkeypatch):
 class MadeUp:
     """Answers as a `Sampling` does, and remembers what it was asked."""
 
+    senses = ()
+
     def __init__(self):
         self.asked = []
 
@@ -261,3 +263,21 @@ def test_without_zoom_new_limits_are_a_window():
 def test_an_impossible_quantity():
     with pytest.raises(ValueError, match='quantity must be "x1" or "x2", got \'x3\''):
         MadeUp().diagram((0.0, 1.0)).plot(quantity="x3")
+
+
+def test_a_parameter_that_rises_and_falls_keeps_its_attractor():
+    """From -0.55 to the Hopf point at -0.26365 an equilibrium and a cycle coexist."""
+    osc = jb.presets.class_b(0.3, NU1)
+    both = jb.orbit_diagram(osc, nu0, (-0.6, -0.2), rows=9, y0=(0.0, 0.0), sense="both")
+    up, down = both.kind.T
+    assert up.tolist() == ["equilibrium"] * 7 + ["cycle"] * 2
+    assert down.tolist() == ["equilibrium"] + ["cycle"] * 8
+    # What is found is what a start on it leads to.
+    alone = jb.orbit_diagram(osc, nu0, (-0.5, -0.3), rows=2, y0=(float(both.x1[2, 1].max()), 0.0))
+    assert alone.period[:, 0] == pytest.approx(both.period[[2, 6], 1], rel=1e-6)
+    for sense, start in (("up", 0), ("down", 1)):
+        one = jb.orbit_diagram(osc, nu0, (-0.6, -0.2), rows=9, y0=(0.0, 0.0), sense=sense)
+        assert np.array_equal(one.kind[:, 0], both.kind[:, start])
+        assert np.array_equal(one.period[:, 0], both.period[:, start], equal_nan=True)
+    labels = [line.get_label() for line in both.plot().lines]
+    assert "cycle, parameter falling" in labels

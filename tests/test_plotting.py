@@ -12,7 +12,7 @@ from matplotlib.text import Text
 
 import jaxbelt as jb
 from jaxbelt import paper as reproduce
-from jaxbelt.bifurcations.diagrams import Branch
+from jaxbelt.bifurcations.pieces import Branch
 from jaxbelt.cycles.chains import Chain
 from jaxbelt.motion.arcs import Ends
 from jaxbelt.plotting.phase import _vector_field, draw_overview, stick_phases

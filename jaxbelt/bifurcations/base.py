@@ -31,23 +31,18 @@ from jaxtyping import Array, ArrayLike
 
 from ..checks import check_belt, is_concrete, number, require, require_value
 from ..cycles.attractors import PLACE_DIMENSIONS, place_of
-from ..cycles.chains import SIZES, Chain, Loop
+from ..cycles.chains import SIZES, Chain, Loop, blank_loop
 from ..cycles.cycle import Cycle
+from ..model.families import Family
 from ..model.oscillator import Oscillator, has_clock
 from ..model.own_units import in_own_units, quantity, rescaled
-from ..model.variations import Family, Variation
-from ..motion.arcs import Ends
+from ..model.variations import Variation
 from ..results import Status, describe, draw
 from ..tables import require_single, table_of
 from .beside import Side
 from .labels import AttractingCycle, Label
 from .special import SpecialPoint, Trail
-from .systems import (
-    NOWHERE,
-    AbstractSystem,
-    Solution,
-    judged_by,
-)
+from .systems import NOWHERE, AbstractSystem, Solution, judged_by
 
 if TYPE_CHECKING:
     import pandas
@@ -556,20 +551,8 @@ def point_of(
 ) -> BifurcationPoint:
     """The point of a solution, NaN where the status is not OK."""
     status = judged_by(solution.error, family, status)
-    known = _where_known(status)
-    return BifurcationPoint(
-        condition=UNNAMED,
-        value=solution.p[0] * known,
-        residual=solution.residual * known,
-        iterations=solution.iterations,
-        steps=solution.steps,
-        error=solution.error * known,
-        multiplier=multiplier * known,
-        x1=jnp.asarray(jnp.nan),
-        oscillator=family.at(solution.p * known),
-        cycle=cycle,
-        status=status,
-    )
+    point = _point_at(family, solution, status)
+    return replace(point, multiplier=multiplier * _where_known(status), cycle=cycle)
 
 
 def _where_known(status: Array) -> Array:
@@ -577,30 +560,32 @@ def _where_known(status: Array) -> Array:
     return jnp.where(status == Status.OK, 1.0, jnp.nan)
 
 
+def _point_at(family: Family, solution: Solution, status: Array) -> BifurcationPoint:
+    """The point of a solution, without a cycle."""
+    known, none = _where_known(status), jnp.asarray(jnp.nan)
+    return BifurcationPoint(
+        condition=UNNAMED,
+        value=solution.p[0] * known,
+        residual=solution.residual * known,
+        iterations=solution.iterations,
+        steps=solution.steps,
+        error=solution.error * known,
+        multiplier=none,
+        x1=none,
+        oscillator=family.at(solution.p * known),
+        cycle=None,
+        status=status,
+    )
+
+
 def point_without_cycle(
     family: Family, p, steps, size, error, status, why, x1: ArrayLike = jnp.nan
 ) -> BifurcationPoint:
     """A point at p without a cycle; why: the reason; x1: displacement of the mass at rest."""
-    iterations = jnp.sum(~jnp.isnan(steps))
-    known = _where_known(status)
-    at_point = family.at(p * known)
+    solution = Solution(jnp.zeros(0), p, steps, jnp.sum(~jnp.isnan(steps)), size, error, status)
+    point = _point_at(family, solution, status)
+    loop, none = blank_loop(SIZES[0], len(point.oscillator.belts)), jnp.asarray(jnp.nan)
+    chain = Chain(loop.codes, loop.ends, jnp.zeros((SIZES[0], 1)))
     nan = jnp.full((SIZES[0], 3), jnp.nan)
-    n = len(at_point.belts)
-    chain = Chain(
-        jnp.ones((SIZES[0], n)), jnp.full(SIZES[0], Ends(n).unused), jnp.zeros((SIZES[0], 1))
-    )
-    none = jnp.asarray(jnp.nan)
-    cycle = Cycle(at_point, chain, nan, none, none, iterations, why)
-    return BifurcationPoint(
-        condition=UNNAMED,
-        value=p[0] * known,
-        residual=size * known,
-        iterations=iterations,
-        steps=steps,
-        error=error * known,
-        multiplier=none,
-        x1=jnp.asarray(x1) * known,
-        oscillator=at_point,
-        cycle=cycle,
-        status=status,
-    )
+    cycle = Cycle(point.oscillator, chain, nan, none, none, point.iterations, why)
+    return replace(point, x1=jnp.asarray(x1) * _where_known(status), cycle=cycle)

@@ -21,10 +21,11 @@ from ..activity import note_progress
 from ..cycles.clocked import TimedChain, timed_blocks, turns_of
 from ..cycles.periodic import PeriodicMotion, is_same_motion, motion_at_unknowns, periodic_from
 from ..cycles.shooting import jacobian
+from ..model.families import Family
 from ..model.oscillator import Oscillator
 from ..model.own_units import in_own_units
-from ..model.variations import Family, Variation
-from ..numerics.continuation import Corrected, corrected
+from ..model.variations import Variation
+from ..numerics.continuation import Corrected
 from ..results import Status
 from .base import AbstractCondition, BifurcationPoint
 from .crossings import CrossingSliding
@@ -38,6 +39,7 @@ from .forced import (
 )
 from .systems import WEIGHT
 from .tangencies import GrazingSliding
+from .tracks import corrected_among
 
 #: First, shortest and longest step, of which the parameter's part is measured in parts of the span.
 FIRST_STEP_OF_BRANCH, SHORTEST_STEP_OF_BRANCH, LONGEST_STEP_OF_BRANCH = 2e-3, 1e-7, 2e-2
@@ -112,12 +114,8 @@ def forced_branches(
 
 def _is_known_motion(point: BifurcationPoint, other: BifurcationPoint, line: ForcedLine) -> bool:
     close = abs(float(point.value) - float(other.value)) < 1e-8 * line.length
-    alike = type(point.condition) is type(other.condition)
-    return bool(close and alike and _same(point, other))
-
-
-def _same(point: BifurcationPoint, other: BifurcationPoint) -> bool:
-    return is_same_motion(point.cycle, other.cycle)
+    alike = close and type(point.condition) is type(other.condition)
+    return bool(alike and is_same_motion(point.cycle, other.cycle))
 
 
 # --- one leg: a fixed signature -------------------------------------------------------------------
@@ -141,24 +139,14 @@ class MotionLeg(NamedTuple):
     def begun(cls, line: ForcedLine, row: MotionRow) -> tuple["MotionLeg", Corrected]:
         """The leg of a row, and the unknowns and the tangent of the row, if they are found."""
         leg, u = cls.of(line, row)
-        axis = np.zeros_like(u)
-        axis[-1] = 1.0
-        return leg, leg.corrected(u, axis, 0.0)
+        return leg, leg.corrected(u, np.eye(u.size)[-1], 0.0)
 
     def corrected(self, u: np.ndarray, tangent: np.ndarray, length: float) -> Corrected:
         """As `continuation.corrected`."""
-        unit = self.line.length
-
-        def attempt(family, unknowns):
-            start, _ = unknowns
-            ahead = length if start is u else 0.0
-            args = family, self.chain, self.weights, jnp.asarray(unit)
-            solved = corrected(_linearized_motion, args, start, tangent, ahead)
-            return solved, (solved.u, unit * solved.u[-1:])
-
-        begun = u, unit * (u + length * tangent)[-1:]
-        solved, settled = self.line.variation.relinearised(attempt, begun)
-        return solved._replace(found=bool(solved.found) and bool(settled))
+        units = np.array([self.line.length])
+        args = self.chain, self.weights, jnp.asarray(units[0])
+        given = _linearized_motion, args, units
+        return corrected_among(self.line.variation, *given, u, tangent, length)
 
     def row(self, u: np.ndarray) -> MotionRow:
         z = jnp.asarray(u[:-1] / np.asarray(self.weights)).reshape(-1, 4)
@@ -268,10 +256,7 @@ def _at_end(
     leg: MotionLeg, u: np.ndarray, beyond: np.ndarray, end: float, line: ForcedLine
 ) -> list[MotionRow]:
     part = (end / line.length - u[-1]) / (beyond[-1] - u[-1])
-    guess = u + part * (beyond - u)
-    axis = np.zeros_like(u)
-    axis[-1] = 1.0
-    solved = leg.corrected(guess, axis, 0.0)
+    solved = leg.corrected(u + part * (beyond - u), np.eye(u.size)[-1], 0.0)
     row = leg.row(solved.u) if solved.found else None
     return [row] if row is not None and int(row.motion.status) == Status.OK else []
 

@@ -24,8 +24,8 @@ from ..sweeps.attractor import CYCLE, UNDECIDED, Attractor, signature
 from ..sweeps.fractions import PLACE
 from ..sweeps.grid import Grid
 from ..sweeps.question import LONG_ENOUGH
+from ..sweeps.runs_in_memory import results_of
 from ..sweeps.shares import numbers_of_attractors
-from ..sweeps.work import results_of
 from .guesses import starts as starts_of_scan
 from .labels import Label
 

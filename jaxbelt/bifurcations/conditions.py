@@ -20,8 +20,8 @@ from ..checks import require_one_float, traceable
 from ..cycles.chains import SIZES, Chain, Loop, cut
 from ..cycles.cycle import Cycle, cycle_of
 from ..cycles.shooting import ARC_STEPS, meshed
+from ..model.families import Family
 from ..model.oscillator import Oscillator
-from ..model.variations import Family
 from ..numerics.compiling import jit
 from ..results import Status
 from .base import AbstractCondition, point_of
@@ -59,8 +59,8 @@ class AbstractCycleCondition(AbstractCondition):
         return [one.loop for one in cycles]
 
     def system_at(self, point):
-        chain, z = point.cycle.chain, point.cycle.unknowns
-        loop = Loop(chain.codes, chain.ends, z[:, :2], z[:, 2])
+        chain = point.cycle.chain
+        loop = chain.loop(point.cycle.unknowns)
         ok, data = jnp.asarray(Status.OK.value), self.sought.as_data()
         system, x, _ = _prepared(data, point.oscillator, loop, ok)
         # With the integration steps with which the point was found.

@@ -33,17 +33,18 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..checks import check_belt, is_concrete
+from ..checks import check_belt, is_concrete, pick
 from ..cycles.attractors import extent
-from ..cycles.chains import SIZES, Chain, Loop, cut
+from ..cycles.chains import SIZES, Chain, Loop, cut, first_failure
+from ..cycles.closure import admissible
 from ..cycles.cycle import cycle_of
 from ..cycles.orbits import Orbit, follow_from, place_of_rest
 from ..cycles.separatrices import mode_onward
-from ..cycles.shooting import admissible, flow, meshed
+from ..cycles.shooting import flow, meshed
 from ..model.equilibria import pushes_away, saddles
-from ..model.modes import distinct_places, edges, mode_acceleration, mode_of
+from ..model.families import Family
+from ..model.modes import distinct_places, edge_at, edges, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
-from ..model.variations import Family
 from ..motion.arcs import Ends
 from ..numerics.compiling import each, jit
 from ..numerics.continuation import Stop
@@ -82,11 +83,11 @@ class Connection(CycleSystem):
     arrives: Array
 
     def condition(self, osc, z, miss):
-        return z[-1, 0] - jnp.stack(edges(osc))[self.arrives]
+        return z[-1, 0] - edge_at(osc, self.arrives)
 
     def _beginning(self, osc: Oscillator, entry: Array) -> Array:
         """Difference of its first state from its saddle, [2]."""
-        return entry - jnp.stack([jnp.stack(edges(osc))[self.leaves], jnp.zeros(())])
+        return entry - jnp.stack([edge_at(osc, self.leaves), jnp.zeros(())])
 
     def residual(self, osc, x):
         closed = super().residual(osc, x)
@@ -132,7 +133,7 @@ class Connection(CycleSystem):
         # The weakest push away from either saddle.
         away = jnp.stack(pushes_away(osc))[:, jnp.stack([self.leaves, self.arrives])]
         tests["BoundaryEquilibrium", ()] = jnp.min(away)
-        leaves, arrives = jnp.stack(edges(osc))[jnp.stack([self.leaves, self.arrives])]
+        leaves, arrives = edge_at(osc, jnp.stack([self.leaves, self.arrives]))
         tests["MeetingEdges", ()] = jnp.where(leaves == arrives, jnp.nan, leaves - arrives)
         return Seen(tests, exists, jnp.asarray(jnp.nan), error)
 
@@ -242,7 +243,7 @@ class SaddleConnection(AbstractCondition):
 
 
 def _from_edge(osc: Oscillator, codes: Array, x1: Array, edge: Array) -> Array:
-    return x1 - jnp.stack(edges(osc))[edge]
+    return x1 - edge_at(osc, edge)
 
 
 @jit
@@ -256,8 +257,7 @@ def _with_mesh(osc: Oscillator, loop: Loop, leaves: Array, arrives: Array, statu
 def _solved_connection(family: Family, system: Connection, z0, p0, status):
     solution = solve_system(family, system, z0, p0, status)
     osc, z, status = family.at(solution.p), solution.z, solution.status
-    fails = (status == Status.OK) & ~system.exists(osc, z)
-    status = jnp.where(fails, Status.NOT_ADMISSIBLE.value, status)
+    status = first_failure(status, system.exists(osc, z), Status.NOT_ADMISSIBLE)
     closes = jnp.where(system.closes(osc), status, Status.EQUILIBRIUM.value)
     cycle, _ = cycle_of(osc, system.chain, z, solution.iterations, closes, solution.residual)
     return point_of(family, solution, cycle, jnp.asarray(jnp.nan), status), (z, solution.p)
@@ -291,16 +291,10 @@ def _states_on(osc: Oscillator, system: Connection, x: Array) -> Array:
 
 def _departing(osc: Oscillator, edge: Array, rightward: Array, parts: Array, budget: int) -> Orbit:
     """The orbit that leaves the saddle of an edge to one side; parts: whether there is one."""
-    x1 = jnp.where(parts, jnp.stack(edges(osc))[edge], 0.0)
+    x1 = jnp.where(parts, edge_at(osc, edge), 0.0)
     status = jnp.where(parts, Status.OK.value, Status.NOT_FINITE.value)
     y = jnp.stack([x1, jnp.zeros(())])
     return follow_from(osc, mode_onward(osc, x1, rightward), y, status, budget)
-
-
-def _exits(orbit: Orbit) -> Array:
-    """States at the ends of the arcs of an orbit, [arcs, 2]."""
-    last = jnp.arange(orbit.ends.size) == orbit.count - 1
-    return jnp.where(last[:, None], orbit.y, jnp.roll(orbit.entries, -1, axis=0))
 
 
 def _turns_back(osc: Oscillator, orbit: Orbit) -> Array:
@@ -328,7 +322,7 @@ def _nearest_connection(osc: Oscillator, belt: Array, to: Array, size: int):
     def one(start):
         edge, rightward = start
         orbit = _departing(osc, edge, rightward, parts[edge], size - 1)
-        exits = _exits(orbit)
+        exits = orbit.exits
         turns = jnp.where(_turns_back(osc, orbit), 0.0, jnp.inf)
         turned = jnp.abs(exits[:, :1] - positions[None]) + turns[:, None]
         # Distance that an orbit which passes a saddle would have gone farther in its mode.
@@ -359,7 +353,7 @@ def _nearest_connection(osc: Oscillator, belt: Array, to: Array, size: int):
     distances, loops, arrives = each(one)(starts)
     best = jnp.argmin(distances)
     status = jnp.where(jnp.isfinite(distances[best]), Status.OK.value, Status.NOT_TOUCHED.value)
-    loop = jax.tree.map(lambda leaf: leaf[best], loops)
+    loop = pick(loops, best)
     return loop, numbers[starts[0][best]], arrives[best], status
 
 
@@ -400,7 +394,7 @@ def _courses_of(oscs: Oscillator) -> _Courses:
         def one(start):
             edge, rightward = start
             orbit = _departing(osc, edge, rightward, parts[edge], ARCS)
-            extrema = jnp.where(_turns_back(osc, orbit), _exits(orbit)[:, 0], jnp.nan)
+            extrema = jnp.where(_turns_back(osc, orbit), orbit.exits[:, 0], jnp.nan)
             return extrema, orbit.repeats, place_of_rest(osc, orbit)
 
         starts = jnp.repeat(jnp.arange(2 * n), 2), jnp.tile(jnp.array([False, True]), 2 * n)

@@ -18,10 +18,10 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..checks import is_concrete
-from ..cycles.chains import SIZES, Chain, Loop, cut
+from ..cycles.chains import SIZES, Chain, Loop, cut, first_failure
 from ..cycles.cycle import Cycle
 from ..cycles.shooting import meshed
-from ..model.modes import any_of, mode_of
+from ..model.modes import any_of, mode_of, select, velocity_of
 from ..model.oscillator import Belt, Oscillator
 from ..model.transitions import stick_limit
 from ..motion.arcs import Ends
@@ -37,7 +37,6 @@ from .systems import (
     contact_tests,
     nearest_contacts,
     stick_phase_from,
-    velocity_of,
 )
 from .tangencies import Encounter
 
@@ -108,8 +107,7 @@ class CrossingSliding(AbstractStickCondition):
 
     def system(self, osc, loop, status):
         near = arrival_near_limit(osc, loop, self.belt)
-        exists = (status != Status.OK) | jnp.isfinite(near.distance)
-        status = jnp.where(exists, status, Status.NOT_TOUCHED.value)
+        status = first_failure(status, jnp.isfinite(near.distance), Status.NOT_TOUCHED)
         # Having crossed, the orbit may come back to the boundary soon and stick. The equations of
         # that excursion are of second order, so it is left out.
         count = jnp.maximum(jnp.sum(loop.used), 1)
@@ -118,7 +116,7 @@ class CrossingSliding(AbstractStickCondition):
         returns = returns & (loop.ends[after[1]] == loop.ends[near.row])
         returns = returns & (loop.codes[after[2], self.belt] == 0)
         shorter = without_arcs(loop, near.row, jnp.asarray(2))
-        loop, row = jax.tree.map(lambda a, b: jnp.where(returns, a, b), shorter, (loop, near.row))
+        loop, row = select(returns, shorter, (loop, near.row))
         chain, z = meshed(osc, loop)
         return StickLimit(chain, row, near.codes, near.side), z, status
 
@@ -173,8 +171,7 @@ def arrival_near_limit(osc: Oscillator, loop: Loop, belt: int | Array) -> Arriva
 def _limit_met(cycle: Cycle, belt: int | Array) -> tuple[Array, Array]:
     """The end of the stretch at which a cycle arrives, see `StickLimit.side`, and whether a law
     jumps there."""
-    osc, chain, z = cycle.oscillator, cycle.chain, cycle.unknowns
-    loop = Loop(chain.codes, chain.ends, z[:, :2], z[:, 2])
+    osc, loop = cycle.oscillator, cycle.chain.loop(cycle.unknowns)
     near = arrival_near_limit(osc, loop, belt)
     jumps = [(near.codes[i] == 0) & has_jump(one) for i, one in enumerate(osc.belts)]
     return near.side, any_of(jumps)
@@ -203,7 +200,7 @@ def _loop_together(osc: Oscillator, belts: Array) -> tuple[Loop, Array]:
     _, _, orbit = orbit_after_stick(equal, belts[0])
     loop, status = repeated_loop(orbit, SIZES[0], len(osc.belts))
     held = jnp.any(loop.used & jnp.all(loop.codes[:, belts] == 0, axis=-1))
-    return loop, jnp.where((status == Status.OK) & ~held, Status.NOT_TOUCHED.value, status)
+    return loop, first_failure(status, held, Status.NOT_TOUCHED)
 
 
 class SlidingExchange(AbstractCycleCondition):
@@ -237,8 +234,7 @@ class SlidingExchange(AbstractCycleCondition):
         sticks = jnp.any(loop.codes[:, belts] == 0, axis=-1)
         both_touch = jnp.all(jnp.abs(loop.codes[:, belts]) < 1.5, axis=-1)
         exchanges = jnp.any(loop.used & sticks & both_touch)
-        meant = (status != Status.OK) | exchanges
-        status = jnp.where(meant, status, Status.NOT_TOUCHED.value)
+        status = first_failure(status, exchanges, Status.NOT_TOUCHED)
         return Encounter(chain, belts, jnp.asarray(-1), jnp.zeros(())), z, status
 
     def solve(self, variation, osc, value, guess):

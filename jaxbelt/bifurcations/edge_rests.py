@@ -29,9 +29,11 @@ from jaxtyping import Array
 
 from ..checks import is_concrete, require_value
 from ..model.equilibria import EquilibriumKind
+from ..model.families import Family
 from ..model.modes import (
     Mode,
     capacity,
+    edge_at,
     edges,
     force_rounding,
     kinetic_capacity,
@@ -39,18 +41,18 @@ from ..model.modes import (
     mode_of,
     select,
     settle,
+    velocity_of,
 )
 from ..model.oscillator import Oscillator
 from ..model.pseudofocus import edge_focus, field_at_rest
 from ..model.transitions import contact_beside
-from ..model.variations import Family
 from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS
 from ..results import Status
 from .base import AbstractCondition, Line
 from .rests import NOTHING, AbstractRestOfSeveral, criticality, limit_near
 from .special import SpecialPoint, Trail
-from .systems import RestSystem, Tests, small_newton, velocity_of
+from .systems import RestSystem, Tests, small_newton
 
 #: A cycle around a pseudo-focus is as large as a velocity if the range of its x2 is at most so many
 #: times that velocity.
@@ -74,7 +76,7 @@ class _EdgeSystem(RestSystem):
         return self.balance(osc)[None]
 
     def x1(self, osc, x):
-        return jnp.stack(edges(osc))[self.edge]
+        return edge_at(osc, self.edge)
 
     def tests(self, osc, x):
         return {("BoundaryHopf", ()): self.meets_hopf(osc), **self.type_tests(osc)}
@@ -99,7 +101,7 @@ class EdgeRest(_EdgeSystem):
     codes: Array
 
     def balance(self, osc):
-        at, mode = jnp.stack(edges(osc))[self.edge], mode_of(self.codes)
+        at, mode = edge_at(osc, self.edge), mode_of(self.codes)
         needed = mode_acceleration(osc, mode, at, jnp.zeros(()))
         return needed + self.limit * self._held(osc, mode)
 
@@ -108,7 +110,7 @@ class EdgeRest(_EdgeSystem):
 
     def meets_hopf(self, osc):
         # There is none for the end of a segment.
-        at, mode = jnp.stack(edges(osc))[self.edge], mode_of(self.codes)
+        at, mode = edge_at(osc, self.edge), mode_of(self.codes)
         trace = field_at_rest(osc, _where_nothing_holds(osc, mode, at), at)[1]
         return jnp.where(capacity(osc, mode) > 0, jnp.nan, trace)
 
@@ -123,7 +125,7 @@ class EdgeRest(_EdgeSystem):
         It does where belts at rest hold the mass on the other side, and where the end of a segment
         that comes to the edge first.
         """
-        at, rest = jnp.stack(edges(osc))[self.edge], jnp.zeros(())
+        at, rest = edge_at(osc, self.edge), jnp.zeros(())
         sides = _beside_edge(osc, at)
         left, right = (settle(osc, mode, at, rest, self._held(osc, mode)) for mode in sides)
         other = select(self.rightward, left, right)
@@ -135,7 +137,7 @@ class EdgeRest(_EdgeSystem):
 
     def exists(self, osc, x):
         # Whether the contacts on that side are those, and the kinetic limit is a separate one.
-        at, mode = jnp.stack(edges(osc))[self.edge], mode_of(self.codes)
+        at, mode = edge_at(osc, self.edge), mode_of(self.codes)
         left, right = _beside_edge(osc, at)
         jumps = capacity(osc, mode) - kinetic_capacity(osc, mode) > force_rounding(at)
         same = jnp.all(jnp.stack(select(self.rightward, right, left).codes) == self.codes)
@@ -151,7 +153,7 @@ class EdgeBalance(_EdgeSystem):
 
     def _slipping(self, osc: Oscillator) -> tuple[Array, Mode, Mode]:
         """The place of the edge, and the slip modes beside it."""
-        at = jnp.stack(edges(osc))[self.edge]
+        at = edge_at(osc, self.edge)
         left, right = (_where_nothing_holds(osc, mode, at) for mode in (self.left, self.right))
         return at, left, right
 
@@ -169,7 +171,7 @@ class EdgeBalance(_EdgeSystem):
         same = [
             jnp.all(jnp.stack(here.codes) == jnp.stack(mode.codes))
             for here, mode in zip(
-                _beside_edge(osc, jnp.stack(edges(osc))[self.edge]), (self.left, self.right)
+                _beside_edge(osc, edge_at(osc, self.edge)), (self.left, self.right)
             )
         ]
         brakes = sum(capacity(osc, mode) for mode in (self.left, self.right)) > 0
@@ -214,12 +216,13 @@ def pseudo_hopf_limit(trail: Trail) -> SpecialPoint | None:
 def _degenerate_focus(family: Family, edge: Array, guess: Array) -> tuple[Array, Array]:
     """Both parameters of such a pseudo-focus, and the error."""
 
-    def equations(family, p):
+    def equations(given, p):
+        family, edge = given
         osc = family.at(p)
-        system = EdgeBalance(edge, *_beside_edge(osc, jnp.stack(edges(osc))[edge]))
+        system = EdgeBalance(edge, *_beside_edge(osc, edge_at(osc, edge)))
         return jnp.stack([system.balance(osc), system.growth(osc)[0]])
 
-    found, _, residual, _ = small_newton(equations, family, guess)
+    found, _, residual, _ = small_newton(equations, (family, edge), guess)
     return found, residual
 
 
@@ -259,11 +262,12 @@ def _slow_focus(family: Family, system: EdgeBalance, belt: Array, guess: Array):
     Its contacts are those of a belt that moves.
     """
 
-    def equations(family, p):
+    def equations(given, p):
+        family, system, belt = given
         osc = family.at(p)
         return jnp.stack([system.balance(osc), velocity_of(osc, belt)])
 
-    found, _, residual, _ = small_newton(equations, family, guess)
+    found, _, residual, _ = small_newton(equations, (family, system, belt), guess)
     return found, residual
 
 
@@ -385,7 +389,7 @@ def _edge_rests(osc: Oscillator, belt: int | Array) -> tuple[EdgeRest, Array]:
     """Equations of a boundary equilibrium at the edges of a belt, and whether each is distinct."""
     cases = []
     for edge in _edges_of(osc, belt):
-        sides = _beside_edge(osc, jnp.stack(edges(osc))[edge])
+        sides = _beside_edge(osc, edge_at(osc, edge))
         cases += [
             EdgeRest(
                 edge=edge,

@@ -21,11 +21,11 @@ import numpy as np
 from jaxtyping import Array
 
 from ..checks import is_concrete, require_value
-from ..cycles.chains import SIZES, Chain, Loop, following_codes
+from ..cycles.chains import SIZES, Chain, Loop, first_failure, following_codes
 from ..cycles.settling import AT_REST
 from ..cycles.shooting import end_guard, meshed
 from ..cycles.unstable import separating_loop
-from ..model.modes import edges, mode_acceleration, mode_of
+from ..model.modes import edge_at, edges, mode_acceleration, mode_of, select
 from ..model.oscillator import Oscillator
 from ..model.transitions import onset_position
 from ..motion.arcs import Ends
@@ -144,8 +144,7 @@ class AbstractEdgeTouch(AbstractCycleCondition):
     def named(self, point):
         if self.repels:
             return GrazingEdge(self.belt, unstable=True)
-        chain, z = point.cycle.chain, point.cycle.unknowns
-        loop = Loop(chain.codes, chain.ends, z[:, :2], z[:, 2])
+        loop = point.cycle.chain.loop(point.cycle.unknowns)
         belt, either = jnp.asarray(self.belt), jnp.zeros(())
         near = end_near_edge(point.oscillator, loop, belt, either)
         return (GrazingEdge if near.grazes else CornerCollision)(self.belt)
@@ -180,8 +179,7 @@ class AbstractEdgeTouch(AbstractCycleCondition):
 
     def system(self, osc, loop, status):
         near = self._nearest_end(osc, loop)
-        exists = (status != Status.OK) | jnp.isfinite(near.distance)
-        status = jnp.where(exists, status, Status.NOT_TOUCHED.value)
+        status = first_failure(status, jnp.isfinite(near.distance), Status.NOT_TOUCHED)
         loop, row = _without_excursion(osc, loop, near)
         chain, z = meshed(osc, loop)
         repels = jnp.asarray(np.array(self.repels))
@@ -378,7 +376,7 @@ def _without_excursion(osc: Oscillator, loop: Loop, near: EdgeEnd) -> tuple[Loop
     names = Ends(n)
     rows, count = jnp.arange(loop.ends.size), jnp.maximum(jnp.sum(loop.used), 1)
     passes = (loop.ends >= n) & (loop.ends < 3 * n)
-    edge = jnp.stack(edges(osc))[jnp.clip(near.end - n, 0, 2 * n - 1)]
+    edge = edge_at(osc, jnp.clip(near.end - n, 0, 2 * n - 1))
     passes = passes & (loop.exits[:, 0] == edge)
     # The events before and after; extremum of x2 are none.
     events = loop.used & (loop.ends != names.extremum_x2) & (rows != row)
@@ -388,5 +386,4 @@ def _without_excursion(osc: Oscillator, loop: Loop, near: EdgeEnd) -> tuple[Loop
     is_excursion = is_excursion & (before != after)
     without, last = without_arcs(loop, before, (after - before) % count)
     without = eqx.tree_at(lambda t: t.ends, without, without.ends.at[last].set(names.extremum_x1))
-    loop = jax.tree.map(lambda a, b: jnp.where(is_excursion, a, b), without, loop)
-    return loop, jnp.where(is_excursion, last, row)
+    return select(is_excursion, (without, last), (loop, row))

@@ -13,10 +13,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from ..checks import pick
 from ..cycles.attractors import sticks
 from ..cycles.chains import Chain
+from ..cycles.closure import closure, multiplier_and_slopes
 from ..cycles.orbits import first_loop, loop_of
-from ..cycles.shooting import closure, meshed, multiplier_and_slopes
+from ..cycles.shooting import meshed
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import each, jit
@@ -137,9 +139,9 @@ def _extremal_loop(osc: Oscillator, rests: Equilibria, size: int):
         at = 1 + jnp.argmin(jnp.where(extremal, jnp.abs(growth[1:-1]), jnp.inf))
         found = jnp.any(extremal)
         bracket = jnp.where(found, jnp.stack([distances[at - 1], distances[at + 1]]), bracket)
-        return bracket, (jax.tree.map(lambda leaf: leaf[at], orbits), found)
+        return bracket, (pick(orbits, at), found)
 
     _, (orbits, found) = lax.scan(narrow, jnp.array([1e-3, 10.0]), None, length=2)
-    orbit, found = jax.tree.map(lambda leaf: leaf[-1], (orbits, found))
+    orbit, found = pick((orbits, found), -1)
     status = jnp.where(jnp.any(eligible) & found, Status.OK.value, Status.NO_FOLD.value)
     return loop_of(orbit, size, len(osc.belts)), status

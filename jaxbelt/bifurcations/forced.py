@@ -16,61 +16,43 @@ sliding bifurcations. What touches begins as an arc that is cut there, or from a
 left out.
 """
 
-import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array
 
 from ..checks import as_array, check_finite, is_concrete, require
-from ..cycles.chains import Loop
+from ..cycles.chains import Loop, padded_loop
 from ..cycles.clocked import (
-    TimedChain,
     guards_along,
     least_steps,
-    monodromy,
-    monodromy_and_slopes,
-    sticks_in,
-    timed_blocks,
     timed_chain,
-    timed_residual,
     turns_of,
 )
 from ..cycles.periodic import (
-    Followed,
     PeriodicMotion,
     attracted,
-    extrema_of,
     motion_at,
     motions_of,
     nothing_found,
     periodic_from,
 )
-from ..cycles.shooting import jacobian
-from ..model.instants import guards_at, trend_of
-from ..model.modes import STUCK, capacity, mode_acceleration, mode_of
-from ..model.oscillator import Oscillator, at_time, check_clock
+from ..model.instants import guards_trend
+from ..model.modes import STUCK, mode_of
+from ..model.oscillator import Oscillator, check_clock
 from ..model.own_units import OwnOscillator, in_own_units, rescaled
 from ..model.variations import Variation
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from ..results import Status
 from .base import AbstractCondition, BifurcationPoint, Line, point_of
-from .systems import (
-    EXACT_ARC,
-    PARTS_OF_ARC,
-    WEIGHT,
-    AbstractSystem,
-    Seen,
-    on_both_meshes,
-    solve_system,
-)
+from .systems import solve_system
+from .timed_systems import AtLimit, OnUnitCircle, TimedSystem, Touching, place_of_motion
 
 #: Places of a motion from which a condition is tried, the most promising ones first.
 TRIED = 3
@@ -80,8 +62,6 @@ AT_ONSET = 1e-6
 ALIKE_ARCS = 0.1
 #: Smaller jumps between static and kinetic friction, in own units, are none.
 LEAST_JUMP = 1e-6
-#: A multiplier that is off by less is the one that the condition asks for.
-ON_CIRCLE = 1e-6
 #: States from which motions are looked for, in own units.
 STARTS_OF_MOTIONS = (
     (0.5, 0.0),
@@ -92,155 +72,6 @@ STARTS_OF_MOTIONS = (
     (0.0, 0.5),
     (3.0, 0.0),
 )
-
-
-# --- systems --------------------------------------------------------------------------------------
-
-
-class TimedSystem(AbstractSystem):
-    """A periodic motion of a fixed signature and a condition; the unknowns are those of the motion,
-    [N, 4]."""
-
-    chain: eqx.AbstractVar[TimedChain]
-
-    def condition(self, osc: Oscillator, z: Array) -> Array:
-        """What vanishes there."""
-        raise NotImplementedError
-
-    def condition_and_slopes(self, osc_of: Any, z: Array, p: Array) -> Any:
-        """The condition at the parameters p, and its derivatives by z and p."""
-        return jax.value_and_grad(lambda z, p: self.condition(osc_of(p), z), (0, 1))(z, p)
-
-    def judge(self, osc: Oscillator, motion: PeriodicMotion) -> Array:
-        """The status of a solution."""
-        return motion.status
-
-    def residual(self, osc, x):
-        value = timed_residual(osc, self.chain, x)
-        return jnp.append(value.reshape(-1), self.condition(osc, x))
-
-    def linearized(self, osc_of, x, p):
-        osc, along = osc_of(p), jax.jacfwd(osc_of)(p)
-        value, blocks = timed_blocks(osc, along, self.chain, x)
-        last, (by_z, by_p) = self.condition_and_slopes(osc_of, x, p)
-        by_parameter = blocks[..., 4:].reshape(-1, p.size)
-        rows = jnp.concatenate([jacobian(blocks[..., :4]), by_parameter], axis=1)
-        row = jnp.append(by_z.reshape(-1), by_p)
-        return jnp.append(value.reshape(-1), last), jnp.concatenate([rows, row[None]])
-
-    def seen_at(self, osc, x):
-        error = jnp.max(jnp.abs(self.residual(osc, x)))
-        motion = motion_at(osc, self.chain, x, error, jnp.asarray(0), jnp.asarray(0))
-        exists = (motion.status == Status.OK) & (self.judge(osc, motion) == Status.OK)
-        return Seen({}, exists, jnp.real(motion.multipliers[0]), error)
-
-    def place(self, osc, x):
-        none = jnp.full(2, jnp.nan, complex)
-        numbers = jnp.zeros(()), jnp.asarray(0), jnp.asarray(Status.OK.value)
-        return place_of_motion(PeriodicMotion(osc, self.chain, jnp.asarray(x), none, *numbers))
-
-    def shaped(self, x):
-        return x.reshape(-1, 4)
-
-    def weights(self, x):
-        return WEIGHT / (1 + jnp.abs(x.reshape(-1)))
-
-    def remeshed(self, osc, x):
-        loop = Loop(self.chain.codes, self.chain.ends, x[:, :3], x[:, 3])
-        # The mesh has been refined, and will be once more.
-        size = self.chain.mesh.shape[-1] // PARTS_OF_ARC
-        chain, _ = timed_chain(osc, loop, size, self.chain.turns)
-        return eqx.tree_at(lambda system: system.chain, self, chain).refined(osc, x)
-
-    def refined(self, osc: Oscillator, x: Array) -> "TimedSystem":
-        """The same with shorter integration steps on arcs that need them, as `CycleSystem` has."""
-        values = on_both_meshes(self, lambda one: timed_residual(osc, one.chain, x))
-        error = jnp.max(jnp.abs(values[0] - values[1]), axis=-1)
-        mesh = self.chain.mesh
-        fine = jnp.repeat(mesh / PARTS_OF_ARC, PARTS_OF_ARC, axis=-1)
-        coarse = jnp.pad(mesh, [(0, 0), (0, (PARTS_OF_ARC - 1) * mesh.shape[-1])])
-        is_exact = error < EXACT_ARC * (1 + jnp.max(jnp.abs(x[:, :2])))
-        mesh = jnp.where(is_exact[:, None], coarse, fine)
-        return eqx.tree_at(lambda system: system.chain.mesh, self, lax.stop_gradient(mesh))
-
-
-class OnUnitCircle(TimedSystem):
-    """weights[0] + weights[1] trace + weights[2] determinant of the monodromy matrix vanishes.
-
-    weights: (1, 1, 1) a multiplier -1, (1, -1, 1) a multiplier 1, (-1, 0, 1) a determinant of 1.
-    """
-
-    chain: TimedChain
-    parts: Array
-
-    def _of(self, matrix: Array) -> Array:
-        trace = matrix[0, 0] + matrix[1, 1]
-        det = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
-        det = jnp.where(sticks_in(self.chain), 0.0, det)
-        return self.parts[0] + self.parts[1] * trace + self.parts[2] * det
-
-    def condition(self, osc, z):
-        return self._of(monodromy(osc, self.chain, z))
-
-    def condition_and_slopes(self, osc_of, z, p):
-        along = jax.jacfwd(osc_of)(p)
-        matrix, by_z, by_p = monodromy_and_slopes(osc_of(p), along, self.chain, z)
-        value, by_matrix = jax.value_and_grad(self._of)(matrix)
-        contracted = functools.partial(jnp.tensordot, by_matrix, axes=2)
-        return value, (contracted(by_z), contracted(by_p))
-
-    def judge(self, osc, motion):
-        # -1 or 1 where the trace counts; else a pair.
-        wanted = jnp.where(self.parts[1] > 0, -1.0, 1.0)
-        found = motion.multipliers
-        is_there = jnp.min(jnp.abs(found - wanted.astype(complex))) < ON_CIRCLE
-        is_pair = jnp.abs(jnp.imag(found[0])) > ON_CIRCLE
-        fits = jnp.where(self.parts[1] == 0, is_pair, is_there)
-        other = (motion.status == Status.OK) & ~fits
-        return jnp.where(other, Status.OTHER_KIND.value, motion.status)
-
-
-class Touching(TimedSystem):
-    """r = 0 at the end of the arc `row`, at which r' = 0."""
-
-    chain: TimedChain
-    row: Array
-    belt: Array
-
-    def condition(self, osc, z):
-        y = z[self.row + 1]
-        velocities = jnp.stack([belt.velocity for belt in at_time(osc, y[2]).belts])
-        return velocities[self.belt] - osc.omega * y[1]
-
-
-class AtLimit(TimedSystem):
-    """The force that stuck belts need is what they can hold at the end of the arc `row`.
-
-    codes: of the mode in which they stick; rises: 1 where that force is to rise there, -1 where it
-    is to fall, 0 where it may do either.
-    """
-
-    chain: TimedChain
-    row: Array
-    codes: Array
-    rises: Array
-
-    def condition(self, osc, z):
-        y, mode = z[self.row + 1], mode_of(self.codes)
-        now = at_time(osc, y[2])
-        return jnp.abs(mode_acceleration(now, mode, y[0], y[1])) - capacity(now, mode)
-
-    def judge(self, osc, motion):
-        mode, y = mode_of(self.codes), motion.unknowns[self.row + 1]
-
-        def guards(y):
-            return guards_at(osc, mode, y)
-
-        limits = trend_of(osc, mode, guards, (y[0], y[1], y[2])).slope[-2:]
-        values = guards((y[0], y[1], y[2]))[-2:]
-        rises = -jnp.where(values[0] < values[1], limits[0], limits[1])
-        other = (motion.status == Status.OK) & ~(self.rises * rises >= 0)
-        return jnp.where(other, Status.OTHER_KIND.value, motion.status)
 
 
 # --- what conditions have in common ---------------------------------------------------------------
@@ -288,8 +119,7 @@ class ArcRows(NamedTuple):
         return self.put(row - 1, row + 1, first, second)
 
     def loop(self) -> Loop:
-        empty = np.zeros((0, 2))
-        return Followed(self.codes, self.ends, self.z[:, :3], self.z[:, 3], empty, 0).loop()
+        return padded_loop(self.codes, self.ends, self.z[:, :3], self.z[:, 3])
 
 
 class Beginning(NamedTuple):
@@ -304,9 +134,6 @@ class AbstractForcedCondition(AbstractCondition):
     """A condition on a periodic motion of a forced oscillator."""
 
     ends_at_contact: ClassVar[bool] = True
-
-    def kind_along(self, osc, multiplier) -> type[AbstractCondition]:
-        return type(self)
 
     def check(self, osc):
         super().check(osc)
@@ -379,13 +206,6 @@ def _solved_timed_point(family, system, z0, p0, status):
     motion = motion_at(osc, system.chain, z, *numbers)
     status = system.judge(lax.stop_gradient(osc), lax.stop_gradient(motion))
     return point_of(family, solution, motion, jnp.asarray(jnp.nan), status), (z, solution.p)
-
-
-def place_of_motion(motion: PeriodicMotion) -> np.ndarray:
-    """Smallest and largest x1, the same of x2, and the period, [5]."""
-    if int(motion.status) != Status.OK:
-        return np.full(5, np.nan)
-    return np.append(np.asarray(extrema_of(motion)), float(motion.period))
 
 
 def forced_point(
@@ -600,15 +420,15 @@ class _AtArrival(AbstractForcedCondition):
 def _excess(osc: Oscillator, codes: Array, y: Array) -> tuple[Array, Array]:
     """By how much the force that is needed exceeds what the stuck belts hold, and its rate."""
     mode = mode_of(codes)
-    at = trend_of(osc, mode, lambda y: guards_at(osc, mode, y)[-2:], (y[0], y[1], y[2]))
-    nearest = jnp.argmin(at.value)
-    return -at.value[nearest], -at.slope[nearest]
+    at = guards_trend(osc, mode, y)
+    value, slope = at.value[-2:], at.slope[-2:]
+    nearest = jnp.argmin(value)
+    return -value[nearest], -slope[nearest]
 
 
 @jit
 def _guard_slopes(osc: Oscillator, codes: Array, y: Array) -> Array:
-    mode = mode_of(codes)
-    return trend_of(osc, mode, lambda y: guards_at(osc, mode, y), (y[0], y[1], y[2])).slope
+    return guards_trend(osc, mode_of(codes), y).slope
 
 
 class TimedCrossing(_AtArrival):

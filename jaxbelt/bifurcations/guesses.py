@@ -5,6 +5,7 @@ loop repeats.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -13,16 +14,17 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ..cycles.chains import Loop, following_codes
+from ..checks import pick
+from ..cycles.chains import Loop, first_failure, following_codes
 from ..cycles.orbits import Orbit, before_stick_ends, follow, last_loop, loop_of
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates, saddles
-from ..model.modes import STUCK, edges, mode_acceleration, mode_of
+from ..model.modes import STUCK, edges, mode_acceleration, mode_of, select, velocity_of
 from ..model.oscillator import Oscillator
 from ..motion.arcs import Ends
 from ..motion.integrators import STRIDE
 from ..numerics.compiling import each, jit
 from ..results import Status
-from .systems import third_derivative, velocity_of
+from .systems import third_derivative
 
 #: Arcs for which the orbit from slip onset is followed in search of the signature. Of 665 such
 #: orbits (300 oscillators, half of them of round numbers) 84% repeated by then, 87% after 96.
@@ -109,10 +111,7 @@ def approach(osc: Oscillator, rests: Equilibria, start: Array, stride: float | A
         number, *_, pending, _ = state
         return (number == 0) | (pending & (number < ATTEMPTS))
 
-    none = jax.tree.map(
-        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
-        jax.eval_shape(attempt, (jnp.asarray(0), start)),
-    )
+    none = _zeros_of(attempt, (jnp.asarray(0), start))
     first = (jnp.asarray(0), start, *none[2:])
     _, _, orbit, last, _, is_cycle = lax.while_loop(unsettled, attempt, first)
     ended = eqx.tree_at(
@@ -120,7 +119,13 @@ def approach(osc: Oscillator, rests: Equilibria, start: Array, stride: float | A
         orbit,
         (last[1], last[2] + 1, jnp.asarray(Status.OK.value)),
     )
-    return jax.tree.map(lambda a, b: jnp.where(is_cycle, a, b), ended, orbit)
+    return select(is_cycle, ended, orbit)
+
+
+def _zeros_of(function: Callable, argument: Any) -> Any:
+    """Zeros in place of what a function gives."""
+    shapes = jax.eval_shape(function, argument)
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
 
 @jit
@@ -132,8 +137,7 @@ def repeated_loops(
     def run(start):
         orbit = approach(osc, rests, start, stride)
         _, count = last_loop(orbit)
-        fits = (orbit.status != Status.OK) | (count <= size)
-        status = jnp.where(fits, orbit.status, Status.TOO_MANY_ARCS.value)
+        status = first_failure(orbit.status, count <= size, Status.TOO_MANY_ARCS)
         return loop_of(orbit, size, len(osc.belts)), status
 
     osc, rests = lax.stop_gradient((osc, rests))
@@ -154,7 +158,7 @@ def _least_distant(osc: Oscillator, loops: Loop, status: Array, condition: Any):
     at, large = jnp.argmin(distances), jnp.any(status == Status.TOO_MANY_ARCS)
     none = jnp.where(large, Status.TOO_MANY_ARCS.value, Status.NOT_TOUCHED.value)
     found = jnp.isfinite(distances[at])
-    return jax.tree.map(lambda x: x[at], loops), jnp.where(found, Status.OK.value, none)
+    return pick(loops, at), jnp.where(found, Status.OK.value, none)
 
 
 def least_push(osc: Oscillator, loop: Loop, belt: int | Array) -> tuple[Array, Array]:
@@ -197,20 +201,17 @@ def orbit_after_stick(osc: Oscillator, belt: int | Array) -> tuple[Oscillator, A
         number, best, kept = tried
         orbit = follow(moving, states[number], HINT_BUDGET)
         _, push = least_push(moving, loop_of(orbit, HINT_BUDGET, n), belt)
-        x2 = jnp.roll(orbit.entries[:, 1], -1).at[orbit.count - 1].set(orbit.y[1])
+        x2 = orbit.exits[:, 1]
         loops = (orbit.ends == extremum_x2) & (x2 * velocity > 0) & (jnp.arange(HINT_BUDGET) > 0)
         gap = jnp.min(jnp.where(loops, jnp.abs(velocity - osc.omega * x2), jnp.inf))
         sticks = (orbit.status == Status.OK) & jnp.isfinite(push)
         size = jnp.where(sticks, push, 1e6 + gap)
         better = (number == 0) | (size < best)
         new = (size, (states[number], orbit))
-        best, kept = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, (best, kept))
+        best, kept = select(better, new, (best, kept))
         return number + 1, best, kept
 
-    empty = jax.tree.map(
-        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
-        jax.eval_shape(lambda y: (y, follow(moving, y, HINT_BUDGET)), states[0]),
-    )
+    empty = _zeros_of(lambda y: (y, follow(moving, y, HINT_BUDGET)), states[0])
     none = jnp.asarray(0), jnp.asarray(jnp.inf), empty
     several = jnp.maximum(jnp.sum(exists), 1)
     _, _, (start, orbit) = lax.while_loop(lambda tried: tried[0] < several, attempt, none)

@@ -23,10 +23,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..checks import is_concrete, require_value
-from ..cycles.chains import SIZES, Chain, Loop
+from ..checks import is_concrete, pick, require_value
+from ..cycles.chains import SIZES, Chain, Loop, after_each, first_failure
 from ..cycles.shooting import meshed
-from ..model.modes import Mode, any_of, capacity, edges, mode_acceleration
+from ..model.modes import Mode, any_of, capacity, edge_at, edges, mode_acceleration
 from ..model.oscillator import Oscillator
 from ..model.transitions import contact
 from ..results import Status
@@ -125,7 +125,7 @@ class EdgeExchange(AbstractCycleCondition, _BetweenEdges):
     def system(self, osc, loop, status):
         distance, row, pair = _passage_of_edges(osc, loop, self.belts)
         exists = jnp.isfinite(distance) & _both_rub(osc, self.belts)
-        status = jnp.where(exists | (status != Status.OK), status, Status.NOT_TOUCHED.value)
+        status = first_failure(status, exists, Status.NOT_TOUCHED)
         chain, z = meshed(osc, loop)
         return EdgesPassed(chain, row, pair), z, status
 
@@ -142,9 +142,8 @@ def _passage_of_edges(osc: Oscillator, loop: Loop, belts) -> tuple[Array, Array,
     """
     n, positions, pairs = len(osc.belts), jnp.stack(edges(osc)), _edge_pairs(osc, belts)
     passes = (loop.ends >= n) & (loop.ends < 3 * n)
-    last = jnp.arange(loop.ends.size) == jnp.sum(loop.used) - 1
     at = jnp.where(passes, positions[jnp.clip(loop.ends - n, 0, 2 * n - 1)], jnp.nan)
-    following = jnp.where(last, at[0], jnp.roll(at, -1))
+    following = after_each(loop, at)
 
     def distances(pair):
         first, second = positions[pair.first], positions[pair.second]
@@ -155,7 +154,7 @@ def _passage_of_edges(osc: Oscillator, loop: Loop, belts) -> tuple[Array, Array,
 
     found = jax.vmap(distances)(pairs)
     which, row = jnp.divmod(jnp.argmin(found), loop.ends.size)
-    return found[which, row], row, jax.tree.map(lambda leaf: leaf[which], pairs)
+    return found[which, row], row, pick(pairs, which)
 
 
 # --- the mass rests there -------------------------------------------------------------------------
@@ -175,7 +174,7 @@ class EdgesAtRest(RestSystem):
         return self.pair.gap(osc)[None]
 
     def x1(self, osc, x):
-        return jnp.stack(edges(osc))[self.pair.first]
+        return edge_at(osc, self.pair.first)
 
     def exists(self, osc, x):
         """Whether the mass can rest on, or between, them in either order."""
@@ -224,7 +223,7 @@ class MeetingEdges(AbstractRestCondition, _BetweenEdges):
         pairs = _edge_pairs(osc, self.belts)
         sizes = _size(jax.vmap(lambda pair: pair.gap(osc))(pairs))
         at = jnp.argmin(sizes)
-        pair = jax.tree.map(lambda leaf: leaf[at], pairs)
+        pair = pick(pairs, at)
         status = jnp.where(jnp.isfinite(sizes[at]), Status.OK.value, Status.NOT_TOUCHED.value)
         return EdgesAtRest(pair, self.belts), NOTHING, status
 

@@ -25,30 +25,34 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
+from ..checks import pick
 from ..cycles.orbits import Orbit
 from ..cycles.shooting import trace_of
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates, edge_rounding
+from ..model.families import Family
 from ..model.modes import (
     STUCK,
     boundary_guards,
     capacity,
+    edge_at,
     edge_guards,
     edges,
     mode_acceleration,
     mode_of,
+    velocity_of,
 )
 from ..model.oscillator import Oscillator
 from ..model.parameters import leaf_index
 from ..model.pseudofocus import edge_focus
 from ..model.transitions import contact_beside
-from ..model.variations import Family, Variation
+from ..model.variations import Variation
 from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS
 from ..results import Status
 from .base import AbstractCondition, Line, point_without_cycle
 from .guesses import HINT_BUDGET, orbit_after_stick
 from .special import SpecialPoint, Trail
-from .systems import RestSystem, judged_by, small_newton, third_derivative, velocity_of
+from .systems import RestSystem, judged_by, small_newton, third_derivative
 
 #: The unknowns of a state of rest of which all is known.
 NOTHING = np.zeros(0)
@@ -91,10 +95,12 @@ def _prepared_rest(condition: AbstractRestCondition, osc: Oscillator, guess):
 
 
 def _rest_point(family: Family, system: RestSystem, x0, p0, status, why):
-    def equations(family, u):
+    def equations(given, u):
+        family, system = given
         return system.residual(family.at(u[-1:]), u[:-1])
 
-    u, steps, size, error = small_newton(equations, family, jnp.append(x0, p0), family.unit)
+    given, guess = (family, system), jnp.append(x0, p0)
+    u, steps, size, error = small_newton(equations, given, guess, family.unit)
     x, p = u[:-1], u[-1:]
     exists = system.exists(family.at(p), x)
     judged = jnp.where(exists, Status.OK.value, system.otherwise.value)
@@ -145,7 +151,7 @@ class AbstractRestOfSeveral(AbstractRestCondition):
 
 @jit
 def _of_row(tree: Any, row: Array) -> Any:
-    return jax.tree.map(lambda leaf: leaf[row], tree)
+    return pick(tree, row)
 
 
 @jit
@@ -179,7 +185,7 @@ def _solved_nearest(family: Family, systems: RestSystem, x0, p0, status, why):
     """
 
     def at_row(family, row):
-        system, x, said = jax.tree.map(lambda leaf: leaf[row], (systems, x0, status))
+        system, x, said = pick((systems, x0, status), row)
         return _rest_point(family, system, x, p0, said, why)
 
     # The choice has no derivative; nor would the point have one beside rows of NaN.
@@ -330,12 +336,13 @@ def limit_near(
 def _special_hopf(family: Family, codes, guess: Array, vanishes, *args):
     """(x1, both parameters) of such a Hopf point, and the error."""
 
-    def equations(family, u):
+    def equations(given, u):
+        family, codes, *args = given
         osc = family.at(u[1:])
         also = vanishes(osc, codes, u[0], *args)
         return jnp.append(HopfSystem(codes).residual(osc, u[:1]), also)
 
-    u, _, residual, _ = small_newton(equations, family, guess)
+    u, _, residual, _ = small_newton(equations, (family, codes, *args), guess)
     return u, residual
 
 
@@ -364,7 +371,7 @@ class RestingBelt(RestSystem):
         mode = mode_of(self.codes)
         limit = self.side * capacity(osc, mode)
         needed = mode_acceleration(osc, mode, x[0], jnp.zeros(()))
-        away = x[0] - jnp.stack(edges(osc))[self.edge]
+        away = x[0] - edge_at(osc, self.edge)
         rests = jnp.where(self.edge < 0, needed + limit, away)
         return jnp.stack([rests, velocity_of(osc, self.belt)])
 

@@ -114,10 +114,12 @@ def _fold(point, index, v_star):
     # From a narrow band, where the asymptotic solution is good, by equal factors to the given one.
     bands = FIRST * (v_star / FIRST) ** jnp.linspace(0.0, 1.0, STAGES)
 
+    def equations(given, u):
+        point, v_star = given
+        return _equations(point, index, u, u[3], v_star)
+
     def stage(u, v_star):
-        u, _, residual, _ = small_newton(
-            lambda v_star, u: _equations(point, index, u, u[3], v_star), v_star, u
-        )
+        u, _, residual, _ = small_newton(equations, (point, v_star), u)
         return u, residual
 
     start = jnp.append(jnp.array([1.0, 1.0, 1.0]), point.value)
@@ -127,10 +129,12 @@ def _fold(point, index, v_star):
 
 @jit
 def _band(point, index, value):
+    def equations(given, u):
+        point, value = given
+        return _equations(point, index, u, value, jnp.exp(u[3]))
+
     start = jnp.append(jnp.array([1.0, 1.0, 1.0]), jnp.log(TYPICAL))
-    u, _, residual, _ = small_newton(
-        lambda value, u: _equations(point, index, u, value, jnp.exp(u[3])), value, start
-    )
+    u, _, residual, _ = small_newton(equations, (point, value), start)
     return _where_found(value, jnp.exp(u[3]), residual)
 
 

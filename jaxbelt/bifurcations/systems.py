@@ -21,14 +21,16 @@ from jax import lax
 from jaxtyping import Array
 
 from ..cycles.attractors import extent
-from ..cycles.chains import Chain, Loop, following_codes
+from ..cycles.chains import Chain, after_each, first_failure, following_codes
 from ..cycles.cycle import Cycle, cycle_of
 from ..cycles.shooting import jacobian, meshed, residual, residual_and_blocks
+from ..model.families import Family
 from ..model.modes import capacity, edge_guards, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator
-from ..model.variations import Family
+from ..model.pseudofocus import derivatives_at_rest
 from ..motion.arcs import Ends
-from ..numerics.newton import HOLDS, STEP_ROUNDING, Equations, is_settled, newton, solve
+from ..numerics.implicit import Equations, solution
+from ..numerics.newton import HOLDS, STEP_ROUNDING, is_settled, newton, solve
 from ..numerics.padding import longer
 from ..results import Status
 
@@ -97,11 +99,6 @@ class AbstractSystem(eqx.Module):
         """The same system with new integration steps, where there are any."""
 
 
-def velocity_of(osc: Oscillator, belt: int | Array) -> Array:
-    """The velocity of a belt, by its number."""
-    return jnp.stack([one.velocity for one in osc.belts])[belt]
-
-
 def velocity_tests(osc: Oscillator) -> Tests:
     """The velocities of the belts and their differences, which are watched on every curve."""
     velocities = [belt.velocity for belt in osc.belts]
@@ -159,25 +156,45 @@ class RestSystem(AbstractSystem):
         return self
 
 
-# --- systems of a cycle ---------------------------------------------------------------------------
+# --- systems of a closed chain of arcs ------------------------------------------------------------
+
+
+class AbstractChainSystem(AbstractSystem):
+    """A fixed signature and a condition; the unknowns are those of the arcs, [N, 3] or [N, 4]."""
+
+    chain: eqx.AbstractVar[Any]
+
+    @abc.abstractmethod
+    def error_of_steps(self, osc: Oscillator, x: Array) -> Array:
+        """The error of the integration steps in the equations of each arc at x, [N]."""
+
+    def shaped(self, x):
+        return x.reshape(self.chain.ends.size, -1)
+
+    def weights(self, x):
+        return WEIGHT / (1 + jnp.abs(x.reshape(-1)))
+
+    def refined(self, osc: Oscillator, x: Array) -> Any:
+        """The same system with shorter integration steps on arcs that need them.
+
+        The error of the steps in the equations at x decides; steps of length zero pad the other
+        arcs.
+        """
+        mesh = self.chain.mesh
+        fine = jnp.repeat(mesh / PARTS_OF_ARC, PARTS_OF_ARC, axis=-1)
+        coarse = longer(mesh, fine.shape[-1], axis=-1, fill=0.0)
+        is_exact = self.error_of_steps(osc, x) < EXACT_ARC * (1 + jnp.max(jnp.abs(x[:, :2])))
+        mesh = jnp.where(is_exact[:, None], coarse, fine)
+        return eqx.tree_at(lambda system: system.chain.mesh, self, lax.stop_gradient(mesh))
 
 
 def third_derivative(osc: Oscillator, codes: Array, x1: Array) -> Array:
-    """Third derivative of x2' by x2 at a fixed point: 16 times the first Lyapunov coefficient."""
-
-    def derivative(fn):
-        return lambda x2: jax.jvp(fn, (x2,), (jnp.ones_like(x2),))[1]
-
-    def acceleration(x2):
-        return mode_acceleration(osc, mode_of(codes), x1, x2)
-
-    return derivative(derivative(derivative(acceleration)))(jnp.zeros(()))
+    """The third derivative of x2' by x2 at a fixed point."""
+    return derivatives_at_rest(osc, mode_of(codes), x1)[3]
 
 
-class CycleSystem(AbstractSystem):
-    """A fixed signature and a condition; the unknowns are those of the cycle, [N, 3]."""
-
-    chain: eqx.AbstractVar[Chain]
+class CycleSystem(AbstractChainSystem):
+    """A condition on a cycle; the unknowns are those of the cycle, [N, 3]."""
 
     @abc.abstractmethod
     def condition(self, osc: Oscillator, z: Array, miss: Array) -> Array:
@@ -236,33 +253,15 @@ class CycleSystem(AbstractSystem):
     def place(self, osc, x):
         return extent(x[np.asarray(self.chain.used)])
 
-    def shaped(self, x):
-        return x.reshape(-1, 3)
-
-    def weights(self, x):
-        return WEIGHT / (1 + jnp.abs(x.reshape(-1)))
-
     def remeshed(self, osc, x):
-        loop = Loop(self.chain.codes, self.chain.ends, x[:, :2], x[:, 2])
-        return eqx.tree_at(lambda system: system.chain, self, meshed(osc, loop)[0]).refined(osc, x)
+        chain, _ = meshed(osc, self.chain.loop(x))
+        return eqx.tree_at(lambda system: system.chain, self, chain).refined(osc, x)
 
-    def refined(self, osc: Oscillator, x: Array) -> "CycleSystem":
-        """The same system with shorter integration steps on arcs that need them.
-
-        The error of the steps in the equations at x decides; steps of length zero pad the other
-        arcs.
-        """
-        chain = self.chain
-        values, misses = on_both_meshes(self, lambda one: residual(osc, one.chain, x))
+    def error_of_steps(self, osc, x):
+        values, misses = self.chain.on_both_meshes(lambda chain: residual(osc, chain, x))
         error = jnp.max(jnp.abs(values[0] - values[1]), axis=-1)
-        is_tangent = chain.ends >= Ends(chain.codes.shape[-1]).tangent
-        error = jnp.where(is_tangent, jnp.maximum(error, jnp.abs(misses[0] - misses[1])), error)
-        mesh = chain.mesh
-        fine = jnp.repeat(mesh / PARTS_OF_ARC, PARTS_OF_ARC, axis=-1)
-        coarse = longer(mesh, fine.shape[-1], axis=-1, fill=0.0)
-        is_exact = error < EXACT_ARC * (1 + jnp.max(jnp.abs(x[:, :2])))
-        mesh = jnp.where(is_exact[:, None], coarse, fine)
-        return eqx.tree_at(lambda system: system.chain.mesh, self, lax.stop_gradient(mesh))
+        is_tangent = self.chain.ends >= Ends(self.chain.codes.shape[-1]).tangent
+        return jnp.where(is_tangent, jnp.maximum(error, jnp.abs(misses[0] - misses[1])), error)
 
 
 def stick_phase_from(osc: Oscillator, chain: Chain, row: Array) -> Array:
@@ -289,9 +288,7 @@ def nearest_contacts(
     exists. without: belts that are ignored where arcs pass an edge, [arcs, belts].
     """
     n, without = len(osc.belts), jnp.broadcast_to(without, chain.codes.shape)
-    following = jnp.roll(z, -1, axis=0)
-    last = jnp.arange(chain.ends.size) == jnp.sum(chain.used) - 1
-    following = jnp.where(last[:, None], z[0], following)
+    following = after_each(chain, z)
     extrema = chain.used & (chain.ends == Ends(n).extremum_x2)
     passes = (chain.ends >= n) & (chain.ends < 3 * n)
     # Beyond a point to which the cycle shrinks the equations go on, on the other side of the edge.
@@ -335,9 +332,7 @@ def nearest_edge(osc: Oscillator, chain: Chain, z: Array, without: bool | Array 
     """
     n = chain.codes.shape[-1]
     kinds = Ends(n)
-    following = jnp.roll(z, -1, axis=0)
-    last = jnp.arange(chain.ends.size) == jnp.sum(chain.used) - 1
-    following = jnp.where(last[:, None], z[0], following)
+    following = after_each(chain, z)
 
     def distance(codes, end, after, y):
         gap = jnp.min(jnp.stack(edge_guards(osc, mode_of(codes), y[0])))
@@ -409,21 +404,15 @@ def _accuracy(osc: Oscillator, system: Any, z: Array, matrix: Array):
 
     The bound is the effect of the residual with halved steps, and of rounding.
     """
-    values = on_both_meshes(system, lambda one: one.residual(osc, z))
+
+    def value(chain):
+        return eqx.tree_at(lambda s: s.chain, system, chain).residual(osc, z)
+
+    values = system.chain.on_both_meshes(value)
     weights = jnp.linalg.solve(matrix.T, jnp.zeros(values.shape[1]).at[-1].set(1.0))
     # Rounding of states; for durations, however long, the velocity cancels it.
     rounding = 1e-15 * (1 + jnp.max(jnp.abs(z[:, :2]))) * jnp.sum(jnp.abs(weights))
     return jnp.max(jnp.abs(values[0])), 2 * jnp.abs(jnp.sum(weights * values[1])) + rounding
-
-
-def on_both_meshes(system: Any, value: Callable[[Any], Any]) -> Any:
-    """A value of the system with its integration steps as they are, and with all of them halved."""
-    mesh = system.chain.mesh
-    # Padded by steps of length zero to one shape.
-    meshes = jnp.stack(
-        [jnp.concatenate([mesh, jnp.zeros_like(mesh)], axis=1), jnp.repeat(0.5 * mesh, 2, axis=1)]
-    )
-    return lax.map(lambda m: value(eqx.tree_at(lambda s: s.chain.mesh, system, m)), meshes)
 
 
 def judged_by(error: Array, family: Family, status: Array) -> Array:
@@ -431,35 +420,39 @@ def judged_by(error: Array, family: Family, status: Array) -> Array:
 
     DEGENERATE in place of OK where the equations hold and do not determine the parameter.
     """
-    fails = (status == Status.OK) & ~(error < DETERMINED * family.unit)
-    return jnp.where(fails, Status.DEGENERATE.value, status)
+    return first_failure(status, error < DETERMINED * family.unit, Status.DEGENERATE)
 
 
-def small_newton(equations, osc, unknowns, unit: Any = 1.0):
-    """Newton's method for a few equations(osc, unknowns).
+class _FewEquations(Equations):
+    """function(given, units * u) in the unknowns u."""
+
+    function: Callable = eqx.field(static=True)
+    units: Array
+
+    def residual(self, given, z):
+        return self.function(given, self.units * z)
+
+
+def small_newton(function, given, unknowns, unit: Any = 1.0):
+    """Newton's method for a few equations, function(given, unknowns), differentiable by `given`.
 
     unit: of the last unknown. Returns the solution, its steps, its residual and the error of the
     last unknown.
     """
     units = jnp.ones(unknowns.size).at[-1].set(unit)
-
-    def linearized(u, osc):
-        def still(u):
-            return equations(osc, units * u)
-
-        return still(u), jax.jacfwd(still)(u)
+    equations, still = _FewEquations(function, units), lax.stop_gradient(given)
 
     def determined(u):
-        return _determined(u, *linearized(u, lax.stop_gradient(osc)))
+        return _determined(u, *equations.linearized(still, u))
 
     solved = newton(determined, lax.stop_gradient(unknowns) / units)
-    u = lax.stop_gradient(solved.z)
-    # One more step carries the derivatives with respect to the other parameters.
-    value, matrix = linearized(u, osc)
+    u = solved.z
+    # One more step, for the last digit.
+    value, matrix = equations.linearized(still, u)
     change = jnp.linalg.solve(matrix, value)
     # Towards a multiple root steps shrink by a half or a third only.
-    error = _rounding(u, matrix) + 2 * jnp.abs(lax.stop_gradient(change[-1]))
-    u = u - jnp.where(error < DETERMINED, change, 0.0)
+    error = _rounding(u, matrix) + 2 * jnp.abs(change[-1])
+    u = jnp.where(error < DETERMINED, solution(equations, given, u - change), u)
     return units * u, solved.lengths, jnp.max(jnp.abs(value)), unit * error
 
 

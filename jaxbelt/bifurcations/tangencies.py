@@ -23,12 +23,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..cycles.chains import SIZES, Chain, Loop
+from ..cycles.chains import SIZES, Chain, Loop, first_failure
+from ..cycles.closure import admissible
 from ..cycles.orbits import Orbit, follow, last_loop, loop_of
-from ..cycles.shooting import admissible, meshed, trace_of
-from ..model.modes import STUCK, mode_acceleration, mode_of
+from ..cycles.shooting import meshed
+from ..model.families import Family
+from ..model.modes import STUCK, mode_acceleration, mode_of, select, velocity_of
 from ..model.oscillator import Oscillator
-from ..model.variations import Family
+from ..model.pseudofocus import derivatives_at_rest
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from ..numerics.newton import HOLDS, newton
@@ -44,7 +46,6 @@ from .systems import (
     nearest_contacts,
     nearest_edge,
     stick_phase_from,
-    velocity_of,
 )
 
 #: Distance from an equilibrium at which its unstable manifold begins to be followed: the error is
@@ -88,8 +89,7 @@ class Encounter(CycleSystem):
         # the slope may be infinite
         is_wanted = (self.wanted == 0) | (self.wanted * (slope - 1) >= 0)
         fits = ~self.is_tangency | is_wanted
-        other_kind = (cycle.status == Status.OK) & ~fits
-        status = jnp.where(other_kind, Status.OTHER_KIND.value, cycle.status)
+        status = first_failure(cycle.status, fits, Status.OTHER_KIND)
         return status, jnp.where(self.is_tangency, slope, jnp.nan)
 
     def watch(self, osc, z, slope):
@@ -140,10 +140,10 @@ class AbstractTangency(AbstractStickCondition):
 
     def system(self, osc, loop, status):
         fits = jnp.sum(loop.used) < loop.ends.size  # it may need one more arc
-        status = jnp.where(fits | (status != Status.OK), status, Status.TOO_MANY_ARCS.value)
+        status = first_failure(status, fits, Status.TOO_MANY_ARCS)
         loop, row, found = _with_stick(osc, loop, self.belt)
         chain, z = meshed(osc, loop)
-        status = jnp.where(found | (status != Status.OK), status, Status.NOT_TOUCHED.value)
+        status = first_failure(status, found, Status.NOT_TOUCHED)
         status = jnp.where(velocity_of(osc, self.belt) == 0, Status.STUCK_FOREVER.value, status)
         # The arc before the stick arc is the one that becomes tangent.
         before = (row - 1) % jnp.maximum(jnp.sum(chain.used), 1)
@@ -246,7 +246,7 @@ def _nearly_closed(osc: Oscillator, orbit: Orbit, belt: Array, size: int) -> tup
     n = len(osc.belts)
     velocity = velocity_of(osc, belt)
     repeated = orbit.status == Status.OK
-    exits = jnp.roll(orbit.entries, -1, axis=0).at[orbit.count - 1].set(orbit.y)
+    exits = orbit.exits
     rows = jnp.arange(HINT_BUDGET)
     near = (orbit.ends == Ends(n).extremum_x2) & (exits[:, 1] * jnp.sign(velocity) > 0) & (rows > 0)
     last = jnp.argmax(near)
@@ -257,11 +257,10 @@ def _nearly_closed(osc: Oscillator, orbit: Orbit, belt: Array, size: int) -> tup
     returns = jnp.any(near) & ~jnp.any(
         (rows > 0) & (rows <= last) & jnp.any(orbit.codes == 0, axis=-1)
     )
-    orbit = jax.tree.map(lambda a, b: jnp.where(repeated, a, b), orbit, first_loop)
+    orbit = select(repeated, orbit, first_loop)
     _, count = last_loop(orbit)
     status = jnp.where(repeated | returns, Status.OK.value, Status.NOT_TOUCHED.value)
-    fits = (status != Status.OK) | (count <= size)
-    return loop_of(orbit, size, n), jnp.where(fits, status, Status.TOO_MANY_ARCS.value)
+    return loop_of(orbit, size, n), first_failure(status, count <= size, Status.TOO_MANY_ARCS)
 
 
 def _with_stick(osc: Oscillator, loop: Loop, belt: int | Array) -> tuple[Loop, Array, Array]:
@@ -296,7 +295,7 @@ def _with_stick(osc: Oscillator, loop: Loop, belt: int | Array) -> tuple[Loop, A
         entries=inserted(loop.entries, jnp.stack([following[at, 0], velocity / osc.omega])),
         durations=inserted(loop.durations, jnp.zeros(())),
     )
-    loop = jax.tree.map(lambda a, b: jnp.where(has_own, a, b), loop, new)
+    loop = select(has_own, loop, new)
     return loop, jnp.where(has_own, own, at + 1), has_own | jnp.any(loops)
 
 
@@ -315,8 +314,8 @@ def _tangent_departure(family: Family, codes, resting, touched, guess: Array):
     start = _departure(osc, codes, resting)
     orbit = follow(osc, start, HINT_BUDGET)
     names = Ends(len(osc.belts))
-    exits = jnp.roll(orbit.entries, -1, axis=0).at[orbit.count - 1].set(orbit.y)
-    side = jnp.sign(jnp.stack([belt.velocity for belt in osc.belts])[touched])
+    exits = orbit.exits
+    side = jnp.sign(velocity_of(osc, touched))
     loops = (orbit.ends == names.extremum_x2) & (exits[:, 1] * side > 0)
     meets = (loops | (orbit.ends == touched)) & (jnp.arange(HINT_BUDGET) < orbit.count)
     last = jnp.argmax(meets)
@@ -367,7 +366,7 @@ def _departure(osc: Oscillator, codes: Array, belt: Array) -> Array:
     """
     mode, zero = mode_of(codes), jnp.zeros(())
     rest = mode_acceleration(osc, mode, zero, zero)
-    trace, twice_bend = jax.jvp(lambda x2: trace_of(osc, mode, rest, x2)[0], (zero,), (zero + 1,))
+    _, trace, twice_bend, _ = derivatives_at_rest(osc, mode, rest)
     strong = 0.5 * trace + jnp.sqrt(0.25 * trace**2 - 1)
     weak = 1 / strong
     x2 = -codes[belt] * DEPARTURE

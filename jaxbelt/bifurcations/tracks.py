@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
+from ..model.families import Family
 from ..model.oscillator import Oscillator
-from ..model.variations import Family, Variation
+from ..model.variations import Variation
 from ..numerics.compiling import jit
 from ..numerics.continuation import Corrected, CurvePoint, corrected
 from .base import BifurcationPoint
@@ -28,6 +29,33 @@ SHRINKS = 8
 JUMPS = 1e-3
 #: A function that is smaller at both ends of a step is zero all along it, up to rounding.
 ALONG = 1e-12
+
+
+def corrected_among(
+    variation: Variation,
+    linearized: Callable,
+    args: tuple[Any, ...],
+    units: np.ndarray,
+    u: ArrayLike,
+    tangent: ArrayLike,
+    length: float,
+) -> Corrected:
+    """As `continuation.corrected`, among the oscillators of a variation.
+
+    linearized, args: of these, behind the family. units: of the parameters, [k], which are the last
+    of the unknowns u.
+    """
+    start, normal, k = np.asarray(u), np.asarray(tangent), len(units)
+
+    def attempt(family, unknowns):
+        # In the same plane: the first guess of u is `length` ahead, the others lie in it.
+        ahead = length if unknowns[0] is start else 0.0
+        solved = corrected(linearized, (family, *args), unknowns[0], normal, ahead)
+        return solved, (solved.u, units * solved.u[-k:])
+
+    begun = start, units * (start + length * normal)[-k:]
+    solved, agrees = variation.relinearised(attempt, begun)
+    return solved._replace(found=solved.found & agrees)
 
 
 class Track(NamedTuple):
@@ -49,19 +77,8 @@ class Track(NamedTuple):
 
     def corrected(self, u: ArrayLike, tangent: ArrayLike, length: float) -> Corrected:
         """As `continuation.corrected`."""
-        start, normal = np.asarray(u), np.asarray(tangent)
-
-        def attempt(family, unknowns):
-            args = family, self.system, self.weights
-            # In the same plane: the first guess of u is `length` ahead, the others lie in it.
-            ahead = length if unknowns[0] is start else 0.0
-            solved = corrected(_curve_linearized, args, unknowns[0], normal, ahead)
-            return solved, (solved.u, solved.u[-2:])
-
-        solved, agrees = self.variation.relinearised(
-            attempt, (start, (start + length * normal)[-2:])
-        )
-        return solved._replace(found=solved.found & agrees)
+        given = _curve_linearized, (self.system, self.weights), np.ones(2)
+        return corrected_among(self.variation, *given, u, tangent, length)
 
     def unknowns(self, u: np.ndarray) -> np.ndarray:
         """The unknowns of the system."""

@@ -46,6 +46,14 @@ def orbits(
             show_default="none",
         ),
     ] = None,
+    sense: Annotated[
+        str | None,
+        typer.Option(
+            help="up, down or both: each value begins from the attractor of the one before it, as "
+            "the parameter rises or falls; with both, up is start 0 and down is start 1.",
+            show_default="each value begins from --start",
+        ),
+    ] = None,
     quantity: Annotated[
         str, typer.Option(help="x1 or x2: whose extrema the points are, and what is drawn.")
     ] = "x1",
@@ -71,6 +79,8 @@ def orbits(
     - jaxbelt orbits --belt 1,law=coulomb,static=1,kinetic=0.6 --damping 0.1 --force 0.5,1
       --vary "forcing[0].frequency" --span 0.4 0.8 --also 0,0.5
 
+    - jaxbelt orbits --class b --nu1 0.35 --span 0 0.7 --sense both
+
     - jaxbelt orbits --file machine.toml --vary "belts[0].normal_force" --span 5 30
     """
     console = make_console()
@@ -89,7 +99,7 @@ def orbits(
         y0 = [described.start(one) for one in (start, *further)]
         path = described.path_along(parameter, span)
         at = None if described.is_forced else jb.AtExtrema(quantity)
-        found = jb.orbit_diagram(*path, at=at, y0=y0, rows=rows)
+        found = jb.orbit_diagram(*path, at=at, y0=y0, rows=rows, sense=sense)
         if path[1] is None:
             found = replace(found, name=parameter)
         from ..plotting.style import journal_figure, journal_style, save

@@ -22,10 +22,10 @@ from ..model.events import of_one_loop
 from ..model.modes import ABOVE
 from ..model.oscillator import Oscillator
 from ..model.own_units import rescaled_quantity
+from ..motion.arcs import Ends
 from ..results import Status
 from .chains import Chain, Loop, modes_of
 from .cycle import Cycle
-from .shooting import Ends
 
 if TYPE_CHECKING:
     import xarray

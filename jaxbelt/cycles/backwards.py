@@ -18,7 +18,8 @@ from ..model.oscillator import Oscillator
 from ..model.own_units import quantity
 from ..results import Status
 from .chains import Chain, Loop, cut
-from .cycle import Cycle, exactly, sample_cycle
+from .cycle import Cycle, exactly
+from .motions import sampled_chain
 
 
 class BackwardCycle(Cycle):
@@ -33,9 +34,8 @@ class BackwardCycle(Cycle):
     def sample(self, n: int) -> Array:
         """States (x1, x2) at n times evenly spread over one period, ends included, [n, 2]."""
         behind = reversed_in_time(self.oscillator)
-        states = sample_cycle(
-            behind, self.backwards_chain, self.backwards_unknowns, as_whole(n, "n")
-        )
+        given = self.backwards_chain, self.backwards_unknowns, as_whole(n, "n")
+        states = sampled_chain(behind, *given)
         return jnp.flip(states, axis=0) * jnp.array([[1.0, -1.0]])
 
     def __repr__(self) -> str:

@@ -4,21 +4,37 @@ The number of arcs is padded to a few fixed sizes, and their modes and ends are 
 compiled program serves all signatures.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array
 
 from ..model.events import Signature, events_of
 from ..model.own_units import quantity
 from ..motion.arcs import Ends
+from ..numerics.compiling import power_of_two
+from ..results import Status
 
 #: Sizes of chains: the number of arcs is rounded up to one of these; the first one under a trace.
 SIZES = (16, 32, 64)
+
+
+def first_failure(status: Array, fine: Any, code: Status) -> Array:
+    """The status, or the code of a failure in place of OK where something is not fine."""
+    return jnp.where((status == Status.OK) & ~fine, code.value, status)
+
+
+def after_each(chain: "Chain | Loop", rows: Array) -> Array:
+    """Of rows of the arcs the one after each; after the last used arc comes the first."""
+    last = jnp.arange(chain.ends.size) == jnp.sum(chain.used) - 1
+    last = last.reshape(-1, *[1] * (rows.ndim - 1))
+    return jnp.where(last, rows[0], jnp.roll(rows, -1, axis=0))
 
 
 class Chain(eqx.Module):
@@ -40,6 +56,17 @@ class Chain(eqx.Module):
         """The same chain with every integration step halved."""
         return replace(self, mesh=jnp.repeat(self.mesh / 2, 2, axis=-1))
 
+    def loop(self, z: Array) -> "Loop":
+        """The loop with these unknowns, [arcs, parts of the state and 1]."""
+        return Loop(self.codes, self.ends, z[:, :-1], z[:, -1])
+
+    def on_both_meshes(self, value: Callable[[Any], Any]) -> Any:
+        """value(chain) with its integration steps as they are, and with all of them halved."""
+        # Padded by steps of length zero to one shape.
+        as_it_is = jnp.concatenate([self.mesh, jnp.zeros_like(self.mesh)], axis=1)
+        meshes = jnp.stack([as_it_is, self.halved.mesh])
+        return lax.map(lambda mesh: value(replace(self, mesh=mesh)), meshes)
+
 
 class Loop(eqx.Module):
     """One loop of an orbit, arc by arc, padded.
@@ -59,8 +86,7 @@ class Loop(eqx.Module):
     @property
     def exits(self) -> Array:
         """States at the ends of the arcs; after the last used arc comes the first."""
-        last = jnp.arange(self.ends.size) == jnp.sum(self.used) - 1
-        return jnp.where(last[:, None], self.entries[0], jnp.roll(self.entries, -1, axis=0))
+        return after_each(self, self.entries)
 
 
 def blank_loop(size: int, belts: int) -> Loop:
@@ -68,6 +94,22 @@ def blank_loop(size: int, belts: int) -> Loop:
     unused = np.full(size, Ends(belts).unused)
     arrays = np.ones((size, belts)), unused, np.zeros((size, 2)), np.zeros(size)
     return Loop(*map(jnp.asarray, arrays))
+
+
+def padded_loop(
+    codes: np.ndarray, ends: np.ndarray, entries: np.ndarray, durations: np.ndarray
+) -> Loop:
+    """Known arcs as a loop, padded to one of `SIZES`, or to a power of two."""
+    count = len(ends)
+    size = next((one for one in SIZES if one >= count), power_of_two(count, SIZES[-1]))
+    more = size - count
+    return Loop(
+        codes=jnp.asarray(np.pad(codes, [(0, more), (0, 0)], constant_values=1.0)),
+        ends=jnp.asarray(np.pad(ends, (0, more), constant_values=Ends(codes.shape[-1]).unused)),
+        # After the last used arc comes the first one.
+        entries=jnp.asarray(np.concatenate([entries, entries[[0] * more]])),
+        durations=jnp.asarray(np.pad(durations, (0, more))),
+    )
 
 
 def modes_of(loop: Chain | Loop) -> np.ndarray:
@@ -83,9 +125,7 @@ def loop_events(loop: Chain | Loop) -> Signature:
 
 def following_codes(chain: Chain | Loop) -> Array:
     """Contact codes of the arc after each; after the last used arc comes the first."""
-    following = jnp.roll(chain.codes, -1, axis=0)
-    last = jnp.arange(chain.ends.size) == jnp.sum(chain.used) - 1
-    return jnp.where(last[:, None], chain.codes[0], following)
+    return after_each(chain, chain.codes)
 
 
 def room_of(arcs: int) -> int:

@@ -25,13 +25,15 @@ from jax import lax
 from jaxtyping import Array
 
 from ..checks import require
-from ..model.instants import carried, guards_at, trend_of
+from ..model.instants import carried, guards_at, guards_trend, trend_of
 from ..model.modes import capacity, mode_acceleration, mode_of, select
 from ..model.oscillator import Oscillator, at_time, frequencies
 from ..motion.arcs import Ends
 from ..motion.integrators import density
 from ..numerics.compiling import any_lane, jit, power_of_two
-from ..numerics.newton import HOLDS, Equations, Newton, solution, solve
+from ..numerics.implicit import Equations, step_to_root
+from ..numerics.newton import HOLDS
+from ..numerics.polynomials import derivative, polynomial, quintic
 from .chains import Chain, Loop, following_codes
 from .shooting import (
     ARC_STEPS,
@@ -44,7 +46,7 @@ from .shooting import (
     flow,
     jacobian,
     slip_slopes,
-    weighted,
+    with_columns,
 )
 
 #: A step times the density of steps that is wanted there: of order twelve, so that what a step
@@ -167,25 +169,11 @@ def _timed_arc_equations(turns: int, osc: Oscillator, codes, end, mesh, unknown:
 
 def _and_columns(turns: int, osc, along, codes, end, mesh, unknown: Array):
     """`_timed_arc_equations` and their derivatives, by the unknowns and along, [4, 4 + k]."""
-    return _timed_columns(
-        functools.partial(_timed_arc_equations, turns), osc, along, codes, end, mesh, unknown
-    )
 
+    def equations(osc, u):
+        return _timed_arc_equations(turns, osc, codes, end, mesh, u)
 
-def _timed_columns(function: Callable, osc: Oscillator, along: Oscillator | None, *row: Array):
-    """A function of an oscillator and the row of an arc, and its derivatives by the unknowns, the
-    last of the row, and along directions, in a last axis of 4 + k."""
-    *given, unknown = row
-    more = 0 if along is None else jax.tree.leaves(along)[0].size
-
-    def column(direction):
-        if along is None:
-            return jax.jvp(lambda u: function(osc, *given, u), (unknown,), (direction,))
-        moved = jax.tree.map(functools.partial(weighted, direction[4:]), along)
-        tangents = moved, direction[:4]
-        return jax.jvp(lambda o, u: function(o, *given, u), (osc, unknown), tangents)
-
-    return jax.vmap(column, out_axes=(None, -1))(jnp.eye(4 + more))
+    return with_columns(equations, osc, along, unknown)
 
 
 def _by_turns(function: Callable) -> Callable[[int], Callable]:
@@ -241,16 +229,6 @@ class TimedClosed(Equations):
         return change.reshape(-1), jacobian(blocks[..., :4])
 
 
-def solve_timed(osc: Oscillator, chain: TimedChain, guess: Array) -> Newton:
-    """The unknowns of a chain near a guess, differentiable with respect to the oscillator."""
-    return solve(TimedClosed(chain), osc, lax.stop_gradient(guess))
-
-
-def timed_solution(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
-    """The unknowns z, which `solve_timed` has found, differentiable by the oscillator."""
-    return solution(TimedClosed(chain), osc, lax.stop_gradient(z))
-
-
 # --- the monodromy matrix -------------------------------------------------------------------------
 
 
@@ -265,9 +243,13 @@ _arc_maps = _by_turns(_arc_map)
 
 
 @_by_turns
-def _maps_and_slopes(turns, osc, along, *row):
+def _maps_and_slopes(turns, osc, along, codes, end, mesh, unknown: Array):
     """`_arc_map` and its derivatives by the unknowns and along directions, [3, 3, 4 + k]."""
-    return _timed_columns(functools.partial(_arc_map, turns), osc, along, *row)
+
+    def arc_map(osc, u):
+        return _arc_map(turns, osc, codes, end, mesh, u)
+
+    return with_columns(arc_map, osc, along, unknown)
 
 
 def arc_maps(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
@@ -290,7 +272,7 @@ def monodromy(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
 
 @monodromy.def_jvp
 def _(primals, tangents):
-    # By columns, arc by arc, as in `shooting.closure`.
+    # By columns, arc by arc, as in `closure`.
     osc, chain, z = primals
     along, weights = directions_of(osc, tangents[0])
     matrix, by_z, by_osc = monodromy_and_slopes(osc, along, chain, z)
@@ -372,7 +354,7 @@ def guards_along(osc: Oscillator, chain: TimedChain, z: Array) -> tuple[Array, A
         mode = mode_of(codes)
 
         def at(y):
-            found = trend_of(osc, mode, lambda y: guards_at(osc, mode, y), (y[0], y[1], y[2]))
+            found = guards_trend(osc, mode, y)
             return found.value, found.slope
 
         states = states_along(osc, codes, mesh, unknown[:3], unknown[3])
@@ -402,29 +384,21 @@ def _least_between(
     there = jnp.isfinite(at.value)
     h = jnp.diff(states[:, 2])[:, None]
     value, slope, curvature = (jnp.where(there, one, 0.0) for one in at)
-    f, d, c = value, slope[:-1] * h, curvature[:-1] * h**2
-    rise = f[1:] - f[:-1] - d - 0.5 * c
-    steeper, bent = slope[1:] * h - d - c, curvature[1:] * h**2 - c
-    powers = [f[:-1], d, 0.5 * c, 10 * rise - 4 * steeper + 0.5 * bent]
-    powers += [-15 * rise + 7 * steeper - bent, 6 * rise - 3 * steeper + 0.5 * bent]
-
-    def quintic(s):
-        return functools.reduce(lambda total, p: total * s + p, reversed(powers))
-
+    start, end = (
+        (value[part], slope[part] * h, curvature[part] * h**2)
+        for part in (slice(None, -1), slice(1, None))
+    )
+    between = quintic(start, end)
+    slopes = derivative(between)
+    bends = derivative(slopes)
     places = jnp.linspace(0.0, 1.0, 9)
-    values = jnp.stack([quintic(s) for s in places])
+    values = jnp.stack([polynomial(between, s) for s in places])
     s = places[jnp.argmin(values, axis=0)]
     for _ in range(4):
-        first, second = _derivatives(powers, s)
-        s = jnp.clip(s - first / jnp.where(second > 0, second, jnp.inf), 0.0, 1.0)
-    least = jnp.minimum(jnp.min(values, axis=0), quintic(s))
+        first, second = polynomial(slopes, s), polynomial(bends, s)
+        s = jnp.clip(s + step_to_root(first, second, where=second > 0), 0.0, 1.0)
+    least = jnp.minimum(jnp.min(values, axis=0), polynomial(between, s))
     return jnp.where(there[:-1], least, jnp.inf), s
-
-
-def _derivatives(powers: list[Array], s: Array) -> tuple[Array, Array]:
-    first = sum(k * p * s ** (k - 1) for k, p in enumerate(powers) if k)
-    second = sum(k * (k - 1) * p * s ** (k - 2) for k, p in enumerate(powers) if k > 1)
-    return jnp.asarray(first), jnp.asarray(second)
 
 
 #: What is least where x1, and x2, is smallest or largest.
@@ -476,7 +450,7 @@ def _least(
         y = state(s)
         found = trend_of(osc, mode, function, (y[0], y[1], y[2]))
         bends = (found.curvature > 0) & (h > 0)
-        new = s - found.slope / jnp.where(bends, found.curvature * h, 1.0)
+        new = s + step_to_root(found.slope, found.curvature * h, where=bends)
         # At the end of an arc a coordinate may have a kink, and be extreme for that.
         s = jnp.where(bends & (s > 0) & (s < 1) & (new > 0) & (new < 1), new, s)
     return function(state(s))
@@ -485,7 +459,7 @@ def _least(
 def _guard_slope(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
     """How fast the guard that ends an arc rises there; 0 of arcs that end otherwise."""
     mode, names = mode_of(codes), Ends(len(osc.belts))
-    at = trend_of(osc, mode, lambda y: guards_at(osc, mode, y), (y[0], y[1], y[2]))
+    at = guards_trend(osc, mode, y)
     count = at.value.size - 2
     limit = count + jnp.argmin(at.value[count:])
     place = jnp.where(end == names.onset, limit, jnp.clip(end, 0, count - 1))

@@ -10,7 +10,6 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -24,34 +23,25 @@ from ..checks import (
     is_concrete,
     number,
     pick,
-    require,
 )
-from ..model.events import Signature, signature_name
+from ..model.events import signature_name
 from ..model.friction import jump_and_kink
 from ..model.modes import select
 from ..model.oscillator import Oscillator, check_oscillator, has_clock
 from ..model.own_units import in_given_units, in_own_units, quantity
 from ..model.rest import is_neutral
-from ..motion.simulate import Arcs
+from ..motion.arcs import Ends
 from ..numerics.compiling import any_lane, in_groups, jit
 from ..numerics.newton import HOLDS
 from ..numerics.padding import longer
 from ..results import Status, describe, draw
 from ..tables import per_belt, require_single, table_of
-from .chains import SIZES, Chain, Loop, loop_events, modes_of, room_of
+from .chains import SIZES, Chain, Loop, first_failure, modes_of, room_of
+from .closure import admissible, closure
+from .motions import ClosedMotion
 from .orbits import MOST_ARCS, follow, last_loop, loop_of
 from .periodic import motion_reached
-from .shooting import (
-    ARC_STEPS,
-    Ends,
-    admissible,
-    closed,
-    closure,
-    flow,
-    meshed,
-    residual,
-    solve_closed,
-)
+from .shooting import ARC_STEPS, closed, meshed, residual, solve_closed
 
 if TYPE_CHECKING:
     import pandas
@@ -69,7 +59,7 @@ DISTINCT = 1e-2
 SAME_SPEED = 1e-9
 
 
-class Cycle(eqx.Module):
+class Cycle(ClosedMotion):
     """A steady cycle, differentiable with respect to every parameter of its oscillator.
 
     A cycle that sticks begins at the end of its longest stick phase, any other at its largest x1.
@@ -99,13 +89,6 @@ class Cycle(eqx.Module):
         return jnp.sum(self.unknowns[..., 2], axis=-1)
 
     @property
-    def stick_durations(self) -> Array:
-        """Time stuck to each belt in one loop, summed over its stick phases, [belts]."""
-        # A product, so that NaN stays, also for a belt that the mass does not stick to.
-        stuck = jnp.where(self.chain.codes == 0, 1.0, 0.0)
-        return jnp.sum(self.unknowns[..., 2:] * stuck, axis=-2)
-
-    @property
     def x1_min(self) -> Array:
         """Smallest displacement."""
         return jnp.min(self.unknowns[..., 0], axis=-1)
@@ -129,44 +112,6 @@ class Cycle(eqx.Module):
     def stable(self) -> Array:
         """Whether it attracts: `|multiplier|` < 1."""
         return jnp.abs(self.multiplier) < 1
-
-    @property
-    def arcs(self) -> Arcs:
-        """The arcs, smooth pieces in one mode each; NaN, or cut off, where unused."""
-        used = self.chain.used
-        nan = functools.partial(jnp.where, used)
-        entries = jnp.cumsum(self.unknowns[..., 2], axis=-1) - self.unknowns[..., 2]
-        arcs = Arcs(
-            t=nan(entries, jnp.nan),
-            y=jnp.where(used[..., None], self.unknowns[..., :2], jnp.nan),
-            mode=self.chain.codes,
-            duration=nan(self.unknowns[..., 2], jnp.nan),
-        )
-        if is_concrete(self.unknowns) and used.ndim == 1:
-            arcs = pick(arcs, slice(int(np.sum(used))))
-        return arcs
-
-    @property
-    def signature(self) -> Signature:
-        """The events of one loop, ((kind, belt), ...); outside of transformations only."""
-        require(
-            is_concrete(self.chain) and self.chain.ends.ndim == 1,
-            "signature",
-            "asked of one cycle outside of transformations",
-            "a traced or batched cycle",
-        )
-        return loop_events(self.chain) if int(self.status) == Status.OK else ()
-
-    def sample(self, n: int) -> Array:
-        """States evenly spread in time over one period.
-
-        Args:
-            n: Number of states, ends included.
-
-        Returns:
-            The states (x1, x2), [n, 2].
-        """
-        return sample_cycle(self.oscillator, self.chain, self.unknowns, as_whole(n, "n"))
 
     def row(self) -> dict[str, Any]:
         """The row of the cycle in `table`."""
@@ -249,20 +194,6 @@ def as_loop(cycle: Cycle, size: int) -> Loop:
     return Loop(chain.codes[source], ends, z[source, :2], jnp.where(own, z[source, 2], 0.0))
 
 
-@jit
-def sample_cycle(osc: Oscillator, chain: Chain, z: Array, n: int) -> Array:
-    """States at n times evenly spread over one period of a closed chain with the unknowns z."""
-    durations = z[:, 2]
-    ends = jnp.cumsum(durations)
-
-    def at(t):
-        i = jnp.minimum(jnp.searchsorted(ends, t).astype(int), jnp.sum(chain.used) - 1)
-        since = t - ends[i] + durations[i]
-        return flow(osc, chain.codes[i], chain.mesh[i], z[i, :2], since)
-
-    return jax.vmap(at)(jnp.linspace(0.0, 1.0, n) * ends[-1])
-
-
 def cycle_of(
     osc: Oscillator,
     chain: Chain,
@@ -279,14 +210,14 @@ def cycle_of(
     """
     residual, slope = closure(osc, chain, z)
     if error is None:
-        status = _first_failure(status, residual < HOLDS, Status.NO_CONVERGENCE)
+        status = first_failure(status, residual < HOLDS, Status.NO_CONVERGENCE)
     else:
         residual = error
-    status = _first_failure(status, admissible(osc, chain, z), Status.NOT_ADMISSIBLE)
+    status = first_failure(status, admissible(osc, chain, z), Status.NOT_ADMISSIBLE)
     sticks = jnp.any(chain.used[:, None] & (chain.codes == 0))
     # An equilibrium solves the equations, too, with arcs of any duration.
     moves = sticks | (jnp.max(z[:, 1]) - jnp.min(z[:, 1]) > HOLDS)
-    status = _first_failure(status, moves, Status.NO_CONVERGENCE)
+    status = first_failure(status, moves, Status.NO_CONVERGENCE)
     known = functools.partial(jnp.where, status == Status.OK)
     cycle = Cycle(
         oscillator=osc,
@@ -299,10 +230,6 @@ def cycle_of(
         status=status,
     )
     return cycle, slope
-
-
-def _first_failure(status: Array, fine: Array, code: Status) -> Array:
-    return jnp.where((status == Status.OK) & ~fine, code.value, status)
 
 
 @jit
@@ -323,7 +250,7 @@ def _loop_reached_by_lane(osc: Oscillator, y0: Array, size: int):
     orbit = eqx.tree_at(lambda orbit: (orbit.repeats, orbit.count), orbit, loop)
     _, count = last_loop(orbit)
     loop = loop_of(orbit, size, len(osc.belts))
-    status = _first_failure(orbit.status, ~_loop_is_neutral(osc, loop), Status.NEUTRAL)
+    status = first_failure(orbit.status, ~_loop_is_neutral(osc, loop), Status.NEUTRAL)
     return loop, count, _if_it_fits(status, count, size), orbit.y
 
 
@@ -336,7 +263,7 @@ def _loop_is_neutral(osc: Oscillator, loop: Loop) -> Array:
 
 
 def _if_it_fits(status: Array, count: Array, size: int) -> Array:
-    return _first_failure(status, count <= size, Status.TOO_MANY_ARCS)
+    return first_failure(status, count <= size, Status.TOO_MANY_ARCS)
 
 
 def exactly(osc: Oscillator, loop: Loop, status: Array) -> Cycle:
@@ -475,7 +402,7 @@ def _polished(osc: Oscillator, loop: Loop, status: Array, steps: int) -> tuple[C
     error, _ = closure(*lax.stop_gradient((osc, chain.halved, z)))
     # Near a fixed point that hardly attracts or repels all small loops nearly close.
     is_known = off < DISTINCT * jnp.max(jnp.ptp(z[:, :2], axis=0))
-    status = _first_failure(status, (error < HOLDS) & is_known, Status.NO_CONVERGENCE)
+    status = first_failure(status, (error < HOLDS) & is_known, Status.NO_CONVERGENCE)
     return cycle_of(osc, chain, z, iterations, status)[0], error
 
 

@@ -26,7 +26,7 @@ from ..results import Status, describe, draw
 from ..tables import require_single, table_of
 from .chains import Loop
 from .clocked import arc_maps, forcing_period, least_steps, timed_chain, turns_of
-from .periodic import Followed, after_period, arcs_over
+from .followed import Followed, after_period, arcs_over
 
 if TYPE_CHECKING:
     import pandas

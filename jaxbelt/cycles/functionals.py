@@ -19,7 +19,6 @@ from ..checks import check_belt, require_one_of, require_value
 from ..model.modes import Mode, mode_acceleration
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import jit
-from .chains import Chain
 from .cycle import Cycle
 from .periodic import PeriodicMotion
 from .shooting import flow
@@ -214,14 +213,11 @@ def _range(cycle: Cycle | PeriodicMotion, coordinate: str) -> tuple[Array, Array
 @jit
 def _energies(cycle: Cycle) -> Array:
     """[fed, dissipated] in one loop, each the integral of a power over every arc."""
-    return _energies_of(cycle.oscillator, cycle.chain, cycle.unknowns)
 
-
-def _energies_of(osc: Oscillator, chain: Chain, unknowns: Array) -> Array:
     def one(codes, mesh, unknown):
-        return flow(osc, codes, mesh, unknown[:2], unknown[2], _powers)[2:]
+        return flow(cycle.oscillator, codes, mesh, unknown[:2], unknown[2], _powers)[2:]
 
-    return jnp.sum(jax.vmap(one)(chain.codes, chain.mesh, unknowns), axis=0)
+    return jnp.sum(jax.vmap(one)(cycle.chain.codes, cycle.chain.mesh, cycle.unknowns), axis=0)
 
 
 def _powers(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:

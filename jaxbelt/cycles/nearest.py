@@ -18,8 +18,9 @@ from jaxtyping import Array
 from ..model.modes import select
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import each, jit
-from ..numerics.newton import Equations, solution, solve
-from ..numerics.padding import filled_up, longer
+from ..numerics.implicit import Equations, solution
+from ..numerics.newton import solve
+from ..numerics.padding import filled_up, in_batches, longer
 from .outlines import Outline, Pieces, place_on
 
 #: Parts of a piece; pairs of parts that are solved for in one batch, and pieces that are sampled.
@@ -108,12 +109,9 @@ def in_parts(osc: Oscillator, pieces: Pieces) -> Sampled:
     is_point = not np.any(has_extent)
     has_extent[0] |= is_point
     numbers = np.flatnonzero(has_extent)
-    states = np.concatenate(
-        [
-            np.asarray(_states_of(osc, filled_up(pieces, numbers[i : i + PIECES], PIECES)))
-            for i in range(0, len(numbers), PIECES)
-        ]
-    )[: len(numbers)]
+    batches = in_batches(pieces, numbers, PIECES)
+    found = [np.asarray(_states_of(osc, some))[: len(batch)] for batch, some in batches]
+    states = np.concatenate(found)
     ends = np.stack([states[:, :-1], states[:, 1:]]).reshape(2, -1, 2)
     begin = np.tile(np.arange(PARTS) / PARTS, len(numbers))
     parts = numbers.repeat(PARTS), begin, ends.min(axis=0), ends.max(axis=0)

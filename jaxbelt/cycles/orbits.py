@@ -21,6 +21,7 @@ from ..model.modes import (
     mode_acceleration,
     mode_of,
     select,
+    velocity_of,
     zone,
     zone_ends,
 )
@@ -72,6 +73,12 @@ class Orbit(eqx.Module):
     repeats: Array
     status: Array
     done: Array
+
+    @property
+    def exits(self) -> Array:
+        """States at the ends of the arcs, [arcs, 2]."""
+        last = jnp.arange(self.ends.size) == self.count - 1
+        return jnp.where(last[:, None], self.y, jnp.roll(self.entries, -1, axis=0))
 
 
 def _arc(osc: Oscillator, orbit: Orbit, stride: float | Array, reach: float | Array) -> ArcEnd:
@@ -351,7 +358,7 @@ def before_stick_ends(osc: Oscillator, belt: int | Array) -> Array:
     Shortly before slip onset; or, where the zone ends first, on the edge. NaN where neither exists,
     or the belt does not touch.
     """
-    v = jnp.stack([one.velocity for one in osc.belts])[belt] / osc.omega
+    v = velocity_of(osc, belt) / osc.omega
     lower, upper = zone_ends(osc)
     mode = contact(osc, lower, v, rightward=True)
     onset, held = onset_position(osc, mode), capacity(osc, mode)

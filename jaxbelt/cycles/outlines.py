@@ -21,11 +21,11 @@ from ..model.equilibria import equilibria
 from ..model.modes import (
     ABOVE,
     STUCK,
-    Mode,
     capacity,
     force_rounding,
     mode_acceleration,
     mode_of,
+    velocity_of,
     zone_ends,
 )
 from ..model.oscillator import Oscillator
@@ -33,6 +33,7 @@ from ..model.transitions import contact
 from ..motion.arcs import Ends
 from ..motion.integrators import density
 from ..numerics.compiling import each, jit, power_of_two
+from ..numerics.implicit import step_to_root
 from ..numerics.padding import filled_up
 from .backwards import BackwardCycle, moved_in_time
 from .chains import Chain, Loop
@@ -138,10 +139,10 @@ def jumps(osc: Oscillator, belt: Array) -> tuple[Array, Array, Array]:
         The least and the largest x1 of each, [2 * zones], of all zones first of those to the left,
         NaN where there is none; and x2 of the boundary.
     """
-    v = jnp.stack([one.velocity for one in osc.belts])[belt] / osc.omega
+    v = velocity_of(osc, belt) / osc.omega
     low, high = zone_ends(osc)
     stuck = contact(osc, low, v, rightward=True)
-    slips = Mode(tuple(jnp.where(code == STUCK, 1.0, code) for code in stuck.codes))
+    slips = stuck.slipping(1.0)
     zero = jnp.zeros_like(low)
     middle = mode_acceleration(osc, stuck, zero, v)
     kinetic = jnp.abs(mode_acceleration(osc, slips, zero, v) - middle)
@@ -223,10 +224,8 @@ def _one_after_another(osc: Oscillator, chain: Chain, durations: Array, y: Array
         at_end = lax.stop_gradient((osc, last))
         slope = jnp.stack([at_end[1][1], mode_acceleration(at_end[0], mode, *at_end[1])])
         _, rate = jax.jvp(lambda y: end_guard(at_end[0], codes, end, y), (at_end[1],), (slope,))
-        meets = (end != unused) & (rate != 0)
-        late = jnp.where(meets, end_guard(osc, codes, end, last), 0.0)
-        late = late / jnp.where(meets, rate, 1.0)
-        return last - late * slope, (y, known - late)
+        late = step_to_root(end_guard(osc, codes, end, last), rate, where=end != unused)
+        return last + late * slope, (y, known + late)
 
     return lax.scan(through, y, (chain.codes, chain.ends, chain.mesh, durations))[1]
 

@@ -4,11 +4,8 @@ An orbit is followed for n periods of the forcing; its arcs are the signature an
 which `clocked` solves for the motion that repeats after them.
 """
 
-import functools
-import itertools
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -24,42 +21,39 @@ from ..checks import (
     check_finite,
     is_concrete,
     number,
-    pick,
     require,
 )
-from ..model.events import Signature, signature_name
-from ..model.modes import BELOW, STUCK, mode_of, stick_velocity
-from ..model.oscillator import Oscillator, at_time, check_clock, check_oscillator
+from ..model.events import signature_name
+from ..model.modes import STUCK
+from ..model.oscillator import Oscillator, check_clock, check_oscillator
 from ..model.own_units import in_given_units, in_own_units, quantity
 from ..motion.arcs import Ends
-from ..motion.simulate import Arcs, simulate
-from ..numerics.compiling import jit, power_of_two
-from ..numerics.newton import HOLDS
+from ..numerics.compiling import jit
+from ..numerics.implicit import solution
+from ..numerics.newton import HOLDS, solve
 from ..results import Status, describe, draw
 from ..tables import per_belt, require_single, table_of
-from .chains import SIZES, Loop, loop_events
+from .chains import SIZES, Loop, blank_loop, first_failure
 from .clocked import (
     TimedChain,
+    TimedClosed,
     extrema_along,
     forcing_period,
     least_steps,
     monodromy,
     multipliers_of,
-    solve_timed,
     sticks_in,
     timed_admissible,
     timed_chain,
     timed_residual,
-    timed_solution,
     turns_of,
 )
-from .shooting import flow
+from .followed import PERIODS_AT_ONCE, Followed, after_period, arcs_over
+from .motions import ClosedMotion
 
 if TYPE_CHECKING:
     import pandas
 
-#: Periods that are followed in one run, which are the most that a motion may have.
-PERIODS_AT_ONCE = 32
 #: Runs after which an orbit that has not come near a periodic motion is given up.
 MOST_STARTS = 32
 #: States after n periods that differ by less, relative to their size, may be one motion's.
@@ -75,7 +69,7 @@ SAME_STATE, SAME_OF_MOTION = 1e-7, 1e-6
 OUTER_STEPS = 12
 
 
-class PeriodicMotion(eqx.Module):
+class PeriodicMotion(ClosedMotion):
     """A motion of a forced oscillator that repeats after n periods of the forcing.
 
     Differentiable with respect to every parameter of its oscillator.
@@ -131,12 +125,6 @@ class PeriodicMotion(eqx.Module):
         return self.unknowns[jnp.asarray(np.append(0, cuts[:-1] + 1)), :2]
 
     @property
-    def stick_durations(self) -> Array:
-        """Time that it sticks to each belt, [belts], in all its periods."""
-        stuck = jnp.where(self.chain.codes == STUCK, 1.0, 0.0)
-        return jnp.sum(self.unknowns[..., 3:] * stuck, axis=-2)
-
-    @property
     def x1_min(self) -> Array:
         """Smallest displacement."""
         return extrema_of(self)[..., 0]
@@ -160,33 +148,6 @@ class PeriodicMotion(eqx.Module):
     def stable(self) -> Array:
         """Whether both multipliers are inside of the unit circle."""
         return jnp.all(jnp.abs(self.multipliers) < 1, axis=-1)
-
-    @property
-    def arcs(self) -> Arcs:
-        """The arcs, smooth pieces in one mode each; NaN, or cut off, where unused."""
-        used, durations = self.chain.used, self.unknowns[..., 3]
-        nan = functools.partial(jnp.where, used)
-        arcs = Arcs(
-            t=nan(jnp.cumsum(durations, axis=-1) - durations, jnp.nan),
-            y=jnp.where(used[..., None], self.unknowns[..., :2], jnp.nan),
-            mode=self.chain.codes,
-            duration=nan(durations, jnp.nan),
-        )
-        if is_concrete(self.unknowns) and used.ndim == 1:
-            arcs = pick(arcs, slice(int(np.sum(used))))
-        return arcs
-
-    @property
-    def signature(self) -> Signature:
-        """Its events, (kind, belt) each; outside of transformations only."""
-        fits = is_concrete(self.chain) and self.chain.ends.ndim == 1
-        expected = "asked of one motion outside of transformations"
-        require(fits, "signature", expected, "a traced or batched motion")
-        return loop_events(self.chain) if int(self.status) == Status.OK else ()
-
-    def sample(self, n: int) -> Array:
-        """States (x1, x2) at n times evenly spread over its period, ends included, [n, 2]."""
-        return _sampled_motion(self.oscillator, self.chain, self.unknowns, as_whole(n, "n"))
 
     def at(self, osc: Oscillator) -> "PeriodicMotion":
         """The motion with the same signature of another oscillator, near to its own.
@@ -277,122 +238,6 @@ def extrema_of(motion: PeriodicMotion) -> Array:
 _extrema = jit(extrema_along)
 
 
-@jit
-def _sampled_motion(osc: Oscillator, chain: TimedChain, z: Array, n: int) -> Array:
-    ends = jnp.cumsum(z[:, 3])
-
-    def at(t):
-        i = jnp.minimum(jnp.searchsorted(ends, t).astype(int), jnp.sum(chain.used) - 1)
-        since = t - ends[i] + z[i, 3]
-        return flow(osc, chain.codes[i], chain.mesh[i], z[i, :3], since)[:2]
-
-    return lax.map(at, jnp.linspace(0.0, 1.0, n) * ends[-1])
-
-
-# --- orbits, period by period ---------------------------------------------------------------------
-
-
-class Followed(NamedTuple):
-    """An orbit that was followed over whole periods, in NumPy.
-
-    codes, ends, entries (x1, x2, t), durations: of its arcs, as of a `Loop`; starts: the states at
-    the phase 0, [periods + 1, 2]; status: of the run.
-    """
-
-    codes: np.ndarray
-    ends: np.ndarray
-    entries: np.ndarray
-    durations: np.ndarray
-    starts: np.ndarray
-    status: int
-
-    def last(self, periods: int) -> "Followed":
-        """The last periods of it."""
-        cuts = np.flatnonzero(self.ends == Ends(self.codes.shape[-1]).period)
-        first = 0 if periods >= len(cuts) else cuts[-periods - 1] + 1
-        return self._cut(slice(first, None), slice(-periods - 1, None))
-
-    def first(self, periods: int) -> "Followed":
-        """The first periods of it."""
-        cuts = np.flatnonzero(self.ends == Ends(self.codes.shape[-1]).period)
-        return self._cut(slice(cuts[periods - 1] + 1), slice(periods + 1))
-
-    def _cut(self, arcs: slice, starts: slice) -> "Followed":
-        parts = [one[arcs] for one in self[:4]]
-        return self._make([*parts, self.starts[starts], self.status])
-
-    def loop(self) -> Loop:
-        """As a loop, padded to a size of chains."""
-        n, count = self.codes.shape[-1], len(self.ends)
-        size = next((one for one in SIZES if one >= count), power_of_two(count, SIZES[-1]))
-        more = size - count
-        return Loop(
-            codes=jnp.asarray(np.pad(self.codes, [(0, more), (0, 0)], constant_values=1.0)),
-            ends=jnp.asarray(np.pad(self.ends, (0, more), constant_values=Ends(n).unused)),
-            # After the last used arc comes the first one.
-            entries=jnp.asarray(np.concatenate([self.entries, self.entries[[0] * more]])),
-            durations=jnp.asarray(np.pad(self.durations, (0, more))),
-        )
-
-
-def arcs_over(osc: Oscillator, y0: Any, turns: int) -> Followed:
-    """The orbit from the state y0 at the phase 0, over PERIODS_AT_ONCE periods, if it gets so far.
-
-    osc: known, in its own units.
-    """
-    period = float(forcing_period(osc, turns))
-    cuts = period * np.arange(1, PERIODS_AT_ONCE + 1)
-    run = simulate(osc, y0, cuts[-1], ts=cuts)
-    arcs, states = run.arcs, np.asarray(run.ys)
-    modes, times = np.asarray(arcs.mode, float), np.asarray(arcs.t)
-    entries = np.column_stack([np.asarray(arcs.y), times])
-    reached = int(np.sum(np.all(np.isfinite(states), axis=1)))
-    # Arcs of one mode, one after the other, are one; and at the end of a period one is cut.
-    begins = np.flatnonzero(np.any(np.diff(modes, axis=0, prepend=np.nan) != 0, axis=1))
-    names = Ends(modes.shape[1])
-    rows = [(entries[i, 2], 0, entries[i], modes[i]) for i in begins.tolist()]
-    for k in range(reached):
-        inside = modes[begins[np.searchsorted(times[begins], cuts[k], side="right") - 1]]
-        rows.append((cuts[k], 1, np.append(states[k], cuts[k]), inside))
-    rows.sort(key=lambda row: row[:2])
-    last = next(i for i in reversed(range(len(rows))) if rows[i][1]) if reached else 0
-    rows = rows[: last + 1]
-    begun = np.cumsum([row[1] for row in rows])
-    found = [row[2] - np.array([0.0, 0.0, period * k]) for row, k in zip(rows, begun)]
-    for place, row in enumerate(rows):
-        if row[1]:
-            found[place][2] = 0.0
-    lengths = np.diff([row[0] for row in rows])
-    codes = np.array([row[3] for row in rows])
-    ends = [
-        names.period if then[1] else _end_between(names, now[3], then[3])
-        for now, then in itertools.pairwise(rows)
-    ]
-    starts = np.concatenate([[np.asarray(y0, float)], states[:reached]])
-    columns = codes[:-1], np.array(ends, int), np.array(found)[:-1], lengths
-    return Followed(*columns, starts, int(run.status))
-
-
-def _end_between(names: Ends, before: np.ndarray, after: np.ndarray) -> int:
-    """What ends an arc, a number of `Ends`, by the codes of it and of the next one."""
-    n = len(before)
-    apart = np.abs(before) > 1, np.abs(after) > 1
-    for i in np.flatnonzero(apart[0] != apart[1]).tolist():
-        return n + i if BELOW in (before[i], after[i]) else 2 * n + i
-    for changed in ((before != 0) & (after == 0), before * after == -1):
-        if np.any(changed):
-            return int(np.argmax(changed))
-    return names.onset
-
-
-def after_period(osc: Oscillator, followed: Followed) -> np.ndarray:
-    """The last state, from which to go on, exactly on the belt that the mass sticks to."""
-    x1, x2 = followed.starts[-1].tolist()
-    mode = mode_of(jnp.asarray(followed.codes[-1]))
-    velocity = stick_velocity(at_time(osc, jnp.zeros(())), mode, osc.omega * x2)
-    return np.array([x1, float(velocity / osc.omega)])
-
-
 # --- solutions ------------------------------------------------------------------------------------
 
 
@@ -402,14 +247,10 @@ def _polished_motion(
 ) -> tuple[PeriodicMotion, Array]:
     """The motion near a guess of a chain's unknowns, and the error that its steps leave; with more
     than `most` of it there is none."""
-    solved = solve_timed(osc, chain, guess)
+    solved = solve(TimedClosed(chain), osc, guess)
     z, settled = solved.z, solved.unsettled
     still, at = lax.stop_gradient((osc, z))
-    mesh = chain.mesh
-    # Padded by steps of length zero to one shape.
-    halved = jnp.repeat(0.5 * mesh, 2, axis=1)
-    meshes = jnp.stack([jnp.concatenate([mesh, jnp.zeros_like(mesh)], axis=1), halved])
-    values = lax.map(lambda m: timed_residual(still, replace(chain, mesh=m), at), meshes)
+    values = chain.on_both_meshes(lambda one: timed_residual(still, one, at))
     error = jnp.max(jnp.abs(values[0] - values[1]))
     residual = jnp.max(jnp.abs(values[0]))
     fine = (residual < HOLDS) & (settled < KNOWN_MOTION) & (error <= most)
@@ -423,8 +264,7 @@ def _polished_motion(
 def motion_at(osc, chain, z, residual, iterations, status) -> PeriodicMotion:
     """The motion with the unknowns z, NaN with a status where it is none."""
     inside = timed_admissible(*lax.stop_gradient((osc, chain, z)))
-    fails = (status == Status.OK) & ~inside
-    status = jnp.where(fails, Status.NOT_ADMISSIBLE.value, status)
+    status = first_failure(status, inside, Status.NOT_ADMISSIBLE)
     return _motion(osc, chain, z, residual, iterations, status)
 
 
@@ -439,7 +279,7 @@ def _motion(osc, chain, z, residual, iterations, status) -> PeriodicMotion:
 def _motion_with_derivatives(osc: Oscillator, motion: PeriodicMotion) -> PeriodicMotion:
     """A motion that is known, as one of an oscillator by which it can be differentiated."""
     chain, status = motion.chain, motion.status
-    z = timed_solution(osc, chain, motion.unknowns)
+    z = solution(TimedClosed(chain), osc, lax.stop_gradient(motion.unknowns))
     return _motion(osc, chain, z, motion.residual, motion.iterations, status)
 
 
@@ -454,7 +294,7 @@ def solved_from(osc: Oscillator, loop: Loop, turns: int) -> PeriodicMotion:
         converged = int(motion.status) in (Status.OK, Status.NOT_ADMISSIBLE)
         if not converged or float(error) < EXACT_MOTION:
             break
-        chain = replace(chain, mesh=jnp.repeat(0.5 * chain.mesh, 2, axis=1))
+        chain = chain.halved
         finer, remaining = _polished_motion(osc, chain, guess)
         if float(remaining) > 0.1 * float(error):
             break  # the rest is rounding
@@ -469,18 +309,13 @@ def motion_at_unknowns(osc: Oscillator, chain: TimedChain, z: Array) -> Periodic
     converged = int(motion.status) in (Status.OK, Status.NOT_ADMISSIBLE)
     if not converged or float(error) < EXACT_MOTION:
         return motion
-    return solved_from(osc, Loop(chain.codes, chain.ends, z[:, :3], z[:, 3]), chain.turns)
+    return solved_from(osc, chain.loop(z), chain.turns)
 
 
 def nothing_found(osc: Oscillator, turns: int, status: int) -> PeriodicMotion:
     """What is returned where there is no motion: NaN, and why."""
-    n, arcs = len(osc.belts), SIZES[0]
-    chain = TimedChain(
-        jnp.ones((arcs, n)),
-        jnp.full(arcs, Ends(n).unused),
-        jnp.zeros((arcs, 1)),
-        turns=turns,
-    )
+    arcs, loop = SIZES[0], blank_loop(SIZES[0], len(osc.belts))
+    chain = TimedChain(loop.codes, loop.ends, jnp.zeros((arcs, 1)), turns=turns)
     nan, none = jnp.asarray(jnp.nan), jnp.full((arcs, 4), jnp.nan)
     found = jnp.full(2, jnp.nan, complex)
     return PeriodicMotion(osc, chain, none, found, nan, jnp.asarray(0), jnp.asarray(status))

@@ -34,6 +34,7 @@ from ..model.friction import AbstractFriction
 from ..model.modes import edges
 from ..model.oscillator import Oscillator, constant_force
 from ..numerics.compiling import each, jit
+from ..numerics.padding import in_batches
 from ..results import Status
 from .attractors import distinct
 from .backwards import forwards, reversed_in_time, solved
@@ -168,10 +169,8 @@ class Returns:
     def _after(self, osc: Oscillator, starts: np.ndarray) -> tuple[np.ndarray, list[Loop]]:
         """The tops that follow these states, [starts, 2], and the loops, in batches of one size."""
         tops, loops = [np.zeros(0)], []
-        for first in range(0, len(starts), TOPS_AT_ONCE):
-            batch = starts[first : first + TOPS_AT_ONCE]
-            filled = np.concatenate([batch, batch[-1:].repeat(TOPS_AT_ONCE - len(batch), axis=0)])
-            after, ways = _next_tops(osc, jax.device_put(filled))
+        for batch, some in in_batches(starts, np.arange(len(starts)), TOPS_AT_ONCE):
+            after, ways = _next_tops(osc, some)
             tops.append(np.asarray(after)[: len(batch)])
             loops.append(ways)
         return np.concatenate(tops), loops

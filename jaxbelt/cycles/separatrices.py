@@ -48,6 +48,7 @@ from ..model.modes import (
     mode_acceleration,
     mode_of,
     select,
+    velocity_of,
     zone_ends,
 )
 from ..model.oscillator import Oscillator
@@ -222,7 +223,7 @@ def mode_onward(osc: Oscillator, x1: Array, rightward: Array) -> Mode:
     sides = (contact_beside(osc, x1, jnp.zeros(()), rightward=side) for side in (True, False))
     mode = select(rightward, *sides)
     backward = jnp.where(rightward, -1.0, 1.0)
-    return Mode(tuple(jnp.where(code == STUCK, backward, code) for code in mode.codes))
+    return mode.slipping(backward)
 
 
 @jit
@@ -241,10 +242,10 @@ def tangencies(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
     modes of these orbits, [zones, belts]. x2'' = -x2 there, so they are orbits that slip with the
     sign of the belt's velocity.
     """
-    v = jnp.stack([one.velocity for one in osc.belts])[belt] / osc.omega
+    v = velocity_of(osc, belt) / osc.omega
     lower, upper = zone_ends(osc)
     stuck = contact(osc, lower, v, rightward=True)
-    slips = Mode(tuple(jnp.where(code == STUCK, jnp.sign(v), code) for code in stuck.codes))
+    slips = stuck.slipping(jnp.sign(v))
     zero = jnp.zeros_like(lower)
     x1 = mode_acceleration(osc, slips, zero, v)
     kinetic = jnp.abs(x1 - mode_acceleration(osc, stuck, zero, v))
@@ -264,11 +265,11 @@ def corners(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
     orbits that come to them, [zones, belts]. On one side of such an orbit the mass is held, on the
     other it slips away.
     """
-    v = jnp.stack([one.velocity for one in osc.belts])[belt] / osc.omega
+    v = velocity_of(osc, belt) / osc.omega
     lower, upper = zone_ends(osc)
     x1 = jnp.where(v > 0, lower, upper)
     inside, before = (_beside(osc, x1, v, rightward=side) for side in (v > 0, v < 0))
-    slips = _slipping(inside, jnp.sign(v))
+    slips = inside.slipping(jnp.sign(v))
     pull = mode_acceleration(osc, inside, x1, v)
     kinetic = jnp.abs(mode_acceleration(osc, slips, x1, v) - pull)
     exists = (jnp.stack(inside.codes)[belt] == STUCK) & (v != 0)
@@ -278,7 +279,7 @@ def corners(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
     # It comes from the side to which the mass slips away; or, where it crosses there, from the
     # other one.
     away = -jnp.sign(pull)
-    modes = [_slipping(before, sign) for sign in (away, -away)]
+    modes = [before.slipping(sign) for sign in (away, -away)]
     comes = [
         sign * mode_acceleration(osc, mode, x1, v) > 0 for sign, mode in zip((away, -away), modes)
     ]
@@ -292,11 +293,6 @@ def corners(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
 def _beside(osc: Oscillator, x1: Array, x2: Array, *, rightward: Array) -> Mode:
     sides = (contact(osc, x1, x2, rightward=side) for side in (True, False))
     return select(rightward, *sides)
-
-
-def _slipping(mode: Mode, sign: Array) -> Mode:
-    """The mode with the belts that hold the mass slipping with a sign."""
-    return Mode(tuple(jnp.where(code == STUCK, sign, code) for code in mode.codes))
 
 
 def end_points(osc: Oscillator) -> Array:
@@ -392,13 +388,11 @@ def _orbit_from(osc: Oscillator, y: Array, codes: Array, reach: Array, budget: i
     rest = place_of_rest(osc, orbit)
     used = jnp.arange(budget) < orbit.count
     durations = jnp.where(used & jnp.isfinite(orbit.durations), orbit.durations, 0.0)
-    last = (jnp.arange(budget) == orbit.count - 1)[:, None]
-    exits = jnp.where(last, orbit.y, jnp.roll(orbit.entries, -1, axis=0))
 
     def samples(codes, entry, exit_, duration):
         return arc_samples(osc, codes, entry, exit_, duration, ARC_SAMPLES)
 
-    return orbit, rest, *each(samples)(orbit.codes, orbit.entries, exits, durations)
+    return orbit, rest, *each(samples)(orbit.codes, orbit.entries, orbit.exits, durations)
 
 
 @jit

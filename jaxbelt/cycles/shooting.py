@@ -32,32 +32,28 @@ from jaxtyping import Array
 from ..model.instants import carried, field_at
 from ..model.modes import (
     Mode,
-    any_of,
-    boundary_guards,
     capacity,
-    edge_guards,
     edges,
     mode_acceleration,
     mode_of,
-    select,
     stick_velocity,
 )
 from ..model.oscillator import Oscillator, at_time, has_clock
-from ..model.transitions import held_at_boundary, onset_position
+from ..model.transitions import onset_position
 from ..motion.arcs import Ends
 from ..motion.integrators import density
 from ..numerics.compiling import any_lane, lanes_in_one_kernel, one_kernel_alone
+from ..numerics.derivatives import moving_and_fixed
 from ..numerics.extrapolation import Scheme, increments, scheme
-from ..numerics.newton import HOLDS, Equations, moving_and_fixed, solution, solve
-from .chains import Chain, Loop, following_codes
+from ..numerics.implicit import Equations, solution
+from ..numerics.newton import solve
+from .chains import Chain, Loop
 
 #: Integration steps per slip arc (an arc is about a quarter of a loop at most).
 ARC_STEPS = 8
 #: Meshes of more steps than this are laid along a march of steps of this stride over the `density`,
 #: so many at most: those of other ones along even steps, of which some may jump a thin layer.
 EVEN_STEPS, MESH_STRIDE, MESH_MARCH = 32, 0.3, 20_000
-#: An arc of a shorter duration may have none: it is the square root of rounding.
-LASTS = 1e-6
 #: An arc magnifies if its end moves so much faster than its entry.
 MAGNIFIED = 1e4
 
@@ -275,7 +271,7 @@ def trace_of(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
     return slope[None]
 
 
-def _magnifies(osc: Oscillator, codes: Array, entry: Array, exit_: Array) -> Array:
+def magnifies(osc: Oscillator, codes: Array, entry: Array, exit_: Array) -> Array:
     """Whether an arc leads away from a place where the orbit hardly moves, and lingers.
 
     Such is a mass that a slow belt leaves: its end is lost in the rounding of its beginning,
@@ -290,9 +286,9 @@ def _magnifies(osc: Oscillator, codes: Array, entry: Array, exit_: Array) -> Arr
 
 
 def _magnifying(osc: Oscillator, chain: Chain, z: Array) -> Array:
-    """Which of the arcs, [N], magnify an error at their entry; see `_magnifies`."""
+    """Which of the arcs, [N], magnify an error at their entry; see `magnifies`."""
     exits = jnp.roll(z[:, :2], -1, axis=0)
-    return jax.vmap(functools.partial(_magnifies, osc))(chain.codes, z[:, :2], exits)
+    return jax.vmap(functools.partial(magnifies, osc))(chain.codes, z[:, :2], exits)
 
 
 def _arc_equations(osc: Oscillator, codes, end, mesh, backwards, unknown: Array) -> Array:
@@ -343,22 +339,36 @@ def _equations_and_blocks(
     osc: Oscillator, along: Oscillator | None, codes, end, mesh, backwards, unknown: Array
 ):
     """`_arc_equations`, [4], and their derivatives, [4, 3 + k]."""
-    more = 0 if along is None else jax.tree.leaves(along)[0].size
 
     def equations(osc, u):
         return _arc_equations(osc, codes, end, mesh, backwards, u)
 
+    return with_columns(equations, osc, along, unknown)
+
+
+def with_columns(
+    function: Callable[[Oscillator, Array], Array],
+    osc: Oscillator,
+    along: Oscillator | None,
+    unknowns: Array,
+) -> tuple[Array, Array]:
+    """A function of an oscillator and n unknowns, and its derivatives, in a last axis of n + k.
+
+    By the unknowns, and along the k directions `along` in the space of oscillators (an oscillator
+    of arrays [k, ..]; None: none).
+    """
+    n, more = unknowns.size, 0 if along is None else jax.tree.leaves(along)[0].size
+
     def column(direction):
         if along is None:
-            of_unknown = functools.partial(equations, osc)
-            return jax.jvp(of_unknown, (unknown,), (direction,))
-        moved = jax.tree.map(functools.partial(weighted, direction[3:]), along)
-        return jax.jvp(equations, (osc, unknown), (moved, direction[:3]))
+            return jax.jvp(functools.partial(function, osc), (unknowns,), (direction,))
+        moved = jax.tree.map(functools.partial(_weighted, direction[n:]), along)
+        return jax.jvp(function, (osc, unknowns), (moved, direction[:n]))
 
-    return jax.vmap(column, out_axes=(None, -1))(jnp.eye(3 + more))
+    return jax.vmap(column, out_axes=(None, -1))(jnp.eye(n + more))
 
 
-def weighted(weights: Array, slopes: Array) -> Array:
+def _weighted(weights: Array, slopes: Array) -> Array:
     """The sum of the slopes, [k, ..], each times its weight."""
     return jnp.sum(weights.reshape(-1, *[1] * (slopes.ndim - 1)) * slopes, axis=0)
 
@@ -375,7 +385,8 @@ def directions_of(osc: Oscillator, tangents: Oscillator) -> tuple[Oscillator, Ar
     return along, jax.flatten_util.ravel_pytree(tangents)[0]
 
 
-def _arc_columns(chain: Chain, *others: Array) -> tuple[Array, ...]:
+def arc_columns(chain: Chain, *others: Array) -> tuple[Array, ...]:
+    """The columns of a chain, and others, for what is done arc by arc."""
     return chain.codes, chain.ends, chain.mesh, *others
 
 
@@ -385,14 +396,14 @@ def _by_columns(osc: Oscillator, chain: Chain, backwards: Array, z: Array) -> Ar
 
     Reverse mode through all steps takes ten times as long.
     """
-    return _all_arc_equations((osc,), _arc_columns(chain, backwards, z))
+    return _all_arc_equations((osc,), arc_columns(chain, backwards, z))
 
 
 @_by_columns.def_jvp
 def _(primals, tangents):
     osc, chain, backwards, z = primals
     along, weights = directions_of(osc, tangents[0])
-    out, blocks = _equations_and_blocks((osc, along), _arc_columns(chain, backwards, z))
+    out, blocks = _equations_and_blocks((osc, along), arc_columns(chain, backwards, z))
     change = blocks[..., 3:] @ weights
     if tangents[3] is not None:
         change = change + jnp.sum(blocks[..., :3] * tangents[3][:, None], axis=-1)
@@ -436,7 +447,7 @@ def residual_and_blocks(
     [k]).
     """
     backwards = _none(z) if backwards is None else backwards
-    out, blocks = _equations_and_blocks((osc, along), _arc_columns(chain, backwards, z))
+    out, blocks = _equations_and_blocks((osc, along), arc_columns(chain, backwards, z))
     return _mismatch(out, z, backwards), jnp.sum(out[:, 3]), blocks
 
 
@@ -524,151 +535,3 @@ def _with_entries(osc: Oscillator, chain: Chain, backwards: Array, z: Array) -> 
 
 def _is_end(backwards: Array) -> Array:
     return backwards[:, None] & jnp.asarray([True, True, False])[None]
-
-
-@eqx.filter_custom_jvp
-def closure(osc: Oscillator, chain: Chain, z: Array) -> tuple[Array, Array]:
-    """The largest error in the shooting equations, and the determinant of the monodromy matrix.
-
-    The latter with stick phases left out: exp of the mean divergence, and at each crossing of a
-    boundary the determinant of its saltation matrix, x2' after over before. One multiplier of a
-    planar cycle is 1, so this is the other one. Contact edges have determinant one: their saltation
-    matrix is [[1, 0], [jump of x2' / x2, 1]].
-    """
-    entries = jnp.roll(z[:, :2], -1, axis=0)
-    columns = _arc_columns(chain, following_codes(chain), z, entries)
-    errors, factors = _errors_and_factors((osc,), columns)
-    return jnp.max(errors), jnp.prod(factors)
-
-
-@closure.def_jvp
-def _(primals, tangents):
-    # By columns, as in `_by_columns`; the error has no derivative.
-    osc, chain, z = primals
-    along, weights = directions_of(osc, tangents[0])
-    _, by_z, by_osc = multiplier_and_slopes(osc, along, chain, z)
-    change = jnp.sum(by_osc * weights)
-    if tangents[2] is not None:
-        change = change + jnp.sum(by_z * tangents[2])
-    return closure(osc, chain, z), (jnp.zeros(()), change)
-
-
-def _error_and_factor(osc: Oscillator, codes, end, mesh, following, unknown, entry):
-    """The largest error in the equations of an arc, and its factor of the determinant."""
-
-    def followed(unknown, entry):
-        return _error_and_factor_of(osc, codes, end, mesh, following, unknown, entry)
-
-    def nothing(unknown, entry):
-        missed = jnp.append(unknown[:2] - entry, unknown[2])
-        return jnp.max(jnp.abs(missed)), jnp.ones(())
-
-    some = any_lane(end != Ends(len(osc.belts)).unused)
-    return lax.cond(some, followed, nothing, unknown, entry)
-
-
-_errors_and_factors = arc_by_arc(_error_and_factor)
-
-
-def _error_and_factor_of(osc: Oscillator, codes, end, mesh, following, unknown, entry):
-    """`_error_and_factor` of an arc that is used."""
-    back = _magnifies(osc, codes, unknown[:2], entry)
-    start, target = select(back, (entry, unknown[:2]), (unknown[:2], entry))
-    way = jnp.where(back, -1.0, 1.0)
-    steps = jnp.where(back, jnp.flip(mesh), mesh)
-    after = flow(osc, codes, steps, start, way * unknown[2], trace_of)
-    last = jnp.where(back, entry, after[:2])
-    guard = end_guard(osc, codes, end, last)
-    before_crossing = mode_acceleration(osc, mode_of(codes), last[0], last[1])
-    after_crossing = mode_acceleration(osc, mode_of(following), entry[0], entry[1])
-    slips = jnp.all(codes != 0) & (unknown[2] != 0)
-    # The boundary of a belt at rest is passed in an extremum of x1.
-    flips = (end == Ends(len(osc.belts)).extremum_x1) & jnp.any(codes * following == -1)
-    crosses = ((end < len(osc.belts)) | flips) & jnp.all(following != 0)
-    ratio = after_crossing / jnp.where(crosses, before_crossing, 1.0)
-    growth = jnp.where(slips, jnp.exp(jnp.where(slips, way * after[2], 0.0)), 1.0)
-    error = jnp.maximum(jnp.max(jnp.abs(after[:2] - target)), jnp.abs(guard))
-    return error, growth * jnp.where(crosses, ratio, 1.0)
-
-
-def multiplier_and_slopes(
-    osc: Oscillator, along: Oscillator, chain: Chain, z: Array
-) -> tuple[Array, Array, Array]:
-    """The determinant of `closure`, and its derivatives, [N, 3] and [k].
-
-    With respect to z, and along the k directions `along`, as for `residual_and_blocks`. Arc by arc:
-    reverse mode through all of them takes three times as long to compile.
-    """
-    entries = jnp.roll(z[:, :2], -1, axis=0)
-    columns = _arc_columns(chain, following_codes(chain), z, entries)
-    factors, slopes = _factors_and_slopes((osc, along), columns)
-    product = jnp.prod(factors)
-    slopes = slopes * _products_of_others(factors)[:, None]
-    by_z = slopes[:, :3].at[:, :2].add(jnp.roll(slopes[:, 3:5], 1, axis=0))
-    return product, by_z, jnp.sum(slopes[:, 5:], axis=0)
-
-
-def _products_of_others(factors: Array) -> Array:
-    """For each factor the product of all others."""
-    one = jnp.ones(1)
-    before = jnp.cumprod(jnp.concatenate([one, factors[:-1]]))
-    after = jnp.cumprod(jnp.concatenate([one, factors[:0:-1]]))[::-1]
-    return before * after
-
-
-@arc_by_arc
-def _factors_and_slopes(
-    osc: Oscillator, along: Oscillator, codes, end, mesh, following, unknown: Array, entry: Array
-):
-    """The factor of an arc and its derivatives, [5 + k]: by its unknowns, the next entry, the
-    directions."""
-    more = jax.tree.leaves(along)[0].size
-
-    def factor(osc, unknown, entry):
-        return _error_and_factor(osc, codes, end, mesh, following, unknown, entry)[1]
-
-    def column(direction):
-        moved = jax.tree.map(functools.partial(weighted, direction[5:]), along)
-        tangents = moved, direction[:3], direction[3:5]
-        return jax.jvp(factor, (osc, unknown, entry), tangents)
-
-    return jax.vmap(column, out_axes=(None, -1))(jnp.eye(5 + more))
-
-
-def admissible(osc: Oscillator, chain: Chain, z: Array) -> Array:
-    """Whether the oscillator moves along a solution.
-
-    Every arc has a duration >= 0 and stays inside its mode: both ends are examined; between them
-    x1, x2 and the needed force are monotone, and no extremum of x1 is passed unmarked. All belts to
-    which the mass sticks have its velocity. None crosses a boundary, or leaves one beyond an edge,
-    where the mass would stick.
-    """
-    belts = range(len(osc.belts))
-
-    def one(codes, end, unknown, exit_, after, lasts):
-        mode, following = mode_of(codes), mode_of(after)
-        fine = unknown[2] >= -HOLDS
-        for y in (unknown, exit_):
-            inside = jnp.stack([*boundary_guards(osc, mode, y[1]), *edge_guards(osc, mode, y[0])])
-            needed = mode_acceleration(osc, mode, y[0], y[1])
-            holds = ~mode.any_stuck | (jnp.abs(needed) <= capacity(osc, mode) + HOLDS)
-            together = jnp.where(codes == 0, jnp.abs(velocities - osc.omega * y[1]), 0.0)
-            fine = fine & jnp.all(inside >= -HOLDS) & holds & jnp.all(together <= HOLDS)
-        # An arc along which x2 changes its sign passes an extremum of x1 that is no end of an arc.
-        lowest, highest = jnp.minimum(unknown[1], exit_[1]), jnp.maximum(unknown[1], exit_[1])
-        fine = fine & ((lowest >= -HOLDS) | (highest <= HOLDS))
-        # At the point of a corner the arc behind the edge has no duration.
-        on_boundary = jnp.abs(velocities - osc.omega * exit_[1]) <= HOLDS
-        goes_on = on_boundary & (jnp.abs(after) == 1) & lasts
-        hit = [(end == belt) | goes_on[belt] for belt in belts]
-        held, x2 = held_at_boundary(osc, following, hit)
-        needed = mode_acceleration(osc, held, exit_[0], x2)
-        would_stick = jnp.abs(needed) < capacity(osc, held) - HOLDS
-        return fine & ~(any_of(hit) & ~following.any_stuck & would_stick)
-
-    velocities = jnp.stack([belt.velocity for belt in osc.belts])
-    exits, durations = jnp.roll(z[:, :2], -1, axis=0), jnp.roll(z[:, 2], -1)
-    last = jnp.arange(chain.ends.size) == jnp.sum(chain.used) - 1
-    lasts = jnp.where(last, z[0, 2], durations) > LASTS
-    each = jax.vmap(one)(chain.codes, chain.ends, z, exits, following_codes(chain), lasts)
-    return jnp.all(each | ~chain.used)

@@ -17,7 +17,7 @@ from ..model.equilibria import EquilibriumKind
 from ..model.modes import edges
 from ..model.oscillator import Oscillator
 from ..numerics.compiling import each, jit
-from ..numerics.padding import filled_up
+from ..numerics.padding import in_batches
 from ..results import Status
 from .orbits import MOST_ARCS, follow, place_of_rest
 from .outlines import ClosedOutline, OpenOutline, Outline, StraightOutline, jumps, place_on
@@ -137,9 +137,8 @@ def leads_to(portrait: Portrait, starts: np.ndarray) -> list[Destination]:
     states = np.array(starts, float)
     for _ in range(ROUNDS):
         left = np.array([i for i in range(len(starts)) if i not in ends], int)
-        for first in range(0, left.size, STARTS_AT_ONCE):
-            batch = left[first : first + STARTS_AT_ONCE]
-            followed = _followed_on(portrait.oscillator, filled_up(states, batch, STARTS_AT_ONCE))
+        for batch, some in in_batches(states, left, STARTS_AT_ONCE):
+            followed = _followed_on(portrait.oscillator, some)
             for i, status, top, rest, y in zip(batch.tolist(), *map(np.asarray, followed)):
                 states[i] = y
                 end = _destination(portrait, int(status), float(top), float(rest), y)

@@ -11,14 +11,13 @@ of it. So where it finds none, and the oscillator is known, all cycles are searc
 import functools
 from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array
 
 from ..activity import announced
-from ..checks import as_whole, require_value
+from ..checks import as_whole, pick, require_value
 from ..model.equilibria import Equilibria, EquilibriumKind, candidates, equilibria, most_equilibria
 from ..model.modes import STUCK
 from ..model.oscillator import Oscillator, check_oscillator, refuse_clock
@@ -132,11 +131,11 @@ def _separating_in_lanes(still: Oscillator, rests: Equilibria, around: Array, si
         bounded = ~inside[-1] & (first > 0)
         low, high = distances[jnp.maximum(first - 1, 0)], distances[first]
         bracket = jnp.where(bounded, jnp.stack([low, high]), bracket)
-        innermost = jax.tree.map(lambda leaf: leaf[jnp.maximum(first - 1, 0)], orbits)
+        innermost = pick(orbits, jnp.maximum(first - 1, 0))
         return bracket, (inside[0] & ~jnp.all(inside), innermost)
 
     bracket, (found, orbits) = lax.scan(narrow, jnp.array([1e-4, 10.0]), None, length=REFINEMENTS)
-    orbit = jax.tree.map(lambda leaf: leaf[-1], orbits)
+    orbit = pick(orbits, -1)
     status = jnp.where(exists & found[0], Status.OK.value, Status.NO_UNSTABLE_CYCLE.value)
     return loop_of(orbit, size, len(still.belts)), status, bracket[0]
 

@@ -45,7 +45,7 @@ from .modes import (
 )
 from .oscillator import Oscillator, check_oscillator, has_possible_numbers, refuse_clock
 from .own_units import in_given_units, in_own_units, quantity
-from .pseudofocus import edge_focus
+from .pseudofocus import derivatives_at_rest, edge_focus
 from .rest import is_centre
 from .transitions import contact, contact_beside
 
@@ -468,13 +468,5 @@ def _lyapunov_coefficients(osc: Oscillator) -> tuple[Equilibria, Array]:
     found = _all_candidates(osc)
     mode = Mode(tuple(codes.astype(found.x1.dtype) for codes in jnp.moveaxis(found.modes, -1, 0)))
     is_fixed = found.kind == EquilibriumKind.FIXED_POINT
-    rest = jnp.zeros_like(found.x1)
-
-    def derivative(fn):
-        return lambda x2: jax.jvp(fn, (x2,), (jnp.ones_like(x2),))[1]
-
-    def x2_prime(x2):
-        return mode_acceleration(osc, mode, rest, x2)
-
-    third = derivative(derivative(derivative(x2_prime)))(rest)
+    *_, third = derivatives_at_rest(osc, mode, jnp.zeros_like(found.x1))
     return found, jnp.where(is_fixed, third / 16, jnp.nan)

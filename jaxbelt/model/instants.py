@@ -121,6 +121,11 @@ def trend_of(
     return Trend(value, slope, curvature)
 
 
+def guards_trend(osc: Oscillator, mode: Mode, y: TimedState | Array) -> Trend:
+    """The guards of a mode, and how they change in its motion, at a state, also in an array [3]."""
+    return trend_of(osc, mode, lambda y: guards_at(osc, mode, y), (y[0], y[1], y[2]))
+
+
 def guard_sizes(osc: Oscillator, y: TimedState) -> Array:
     """The size of the numbers of which guards are made, with what the time adds to rounding."""
     x1, x2, t = y
@@ -343,7 +348,7 @@ def passed_guard(osc: Oscillator, mode: Mode, guard: Array, y: TimedState) -> In
     # A limit: friction opposed the force that was needed.
     upper, lower = guard == 3 * n, guard == 3 * n + 1
     sign = jnp.where(upper, -1.0, 1.0)
-    slip = Mode(tuple(jnp.where(code == STUCK, sign, code) for code in mode.codes))
+    slip = mode.slipping(sign)
     after = select(upper | lower, slip, after)
     captured = jnp.zeros_like(stuck)
     if has_edges(osc):
@@ -353,7 +358,7 @@ def passed_guard(osc: Oscillator, mode: Mode, guard: Array, y: TimedState) -> In
         rightward = any_of([one & right for one, right in flags])
         beyond = codes_past_edge(at_time(osc, t), mode, y[0], osc.omega * x2, rightward)
         # A sign for those with r = 0, which are resolved below.
-        beyond = Mode(tuple(jnp.where(code == STUCK, 1.0, code) for code in beyond.codes))
+        beyond = beyond.slipping(1.0)
         beyond = Mode(
             tuple(
                 jnp.where(was_stuck & is_there, STUCK, code)

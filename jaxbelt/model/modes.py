@@ -65,6 +65,10 @@ class Mode(eqx.Module):
             for code, touches in zip(self.codes, self.touching, strict=True)
         )
 
+    def slipping(self, sign: float | Array) -> "Mode":
+        """The mode in which the belts that are stuck slip with a sign."""
+        return Mode(tuple(jnp.where(code == STUCK, sign, code) for code in self.codes))
+
 
 def any_of(flags: Sequence[Any]) -> Any:
     """Elementwise `or` of at least one array of booleans, of JAX or of NumPy."""
@@ -274,6 +278,16 @@ def edges(osc: Oscillator) -> list[Array]:
     """Positions of the contact edges in the order of `edge_guards`; infinite: there is none."""
     bounds = interval_ends(osc)
     return [jnp.asarray(float(x)) if isinstance(x, NoEdge) else x for x in bounds]
+
+
+def edge_at(osc: Oscillator, number: int | Array) -> Array:
+    """The place of the edge of that number in `edges`."""
+    return jnp.stack(edges(osc))[number]
+
+
+def velocity_of(osc: Oscillator, belt: int | Array) -> Array:
+    """The velocity of a belt, by its number."""
+    return jnp.stack([one.velocity for one in osc.belts])[belt]
 
 
 def zone_ends(osc: Oscillator) -> tuple[Array, Array]:

@@ -34,8 +34,11 @@ class EdgeFocus(eqx.Module):
     bend: Array
 
 
-def field_at_rest(osc: Oscillator, mode: Mode, x1: Array) -> tuple[Array, Array, Array, Array]:
-    """Taylor coefficients of x2' of a slip mode in x2, from (x1, 0): of order 0 to 3."""
+def derivatives_at_rest(osc: Oscillator, mode: Mode, x1: Array) -> tuple[Array, ...]:
+    """x2' of a slip mode at (x1, 0), and its first three derivatives by x2.
+
+    At a fixed point the third one is 16 times the first Lyapunov coefficient.
+    """
 
     def a(x2):
         return mode_acceleration(osc, mode, x1, x2)
@@ -44,8 +47,14 @@ def field_at_rest(osc: Oscillator, mode: Mode, x1: Array) -> tuple[Array, Array,
         return lambda x2: jax.jvp(fn, (x2,), (jnp.ones_like(x2),))
 
     all_orders = with_slope(with_slope(with_slope(a)))
-    ((of_order_0, of_order_1), (_, second)), (_, (_, third)) = all_orders(jnp.zeros_like(x1))
-    return of_order_0, of_order_1, second / 2, third / 6
+    ((value, first), (_, second)), (_, (_, third)) = all_orders(jnp.zeros_like(x1))
+    return value, first, second, third
+
+
+def field_at_rest(osc: Oscillator, mode: Mode, x1: Array) -> tuple[Array, Array, Array, Array]:
+    """Taylor coefficients of x2' of a slip mode in x2, from (x1, 0): of order 0 to 3."""
+    value, first, second, third = derivatives_at_rest(osc, mode, x1)
+    return value, first, second / 2, third / 6
 
 
 def edge_focus(osc: Oscillator, left: Mode, right: Mode, edge: Array) -> EdgeFocus:

@@ -25,6 +25,7 @@ from jax.core import Tracer
 
 from ..checks import as_interval, is_concrete, require, require_callable, require_value
 from ..numerics.compiling import depends, is_affine, is_outermost
+from .families import Family
 from .oscillator import (
     NoEdge,
     Oscillator,
@@ -57,65 +58,6 @@ GUESSES = 9
 
 #: What varies a parameter of an oscillator without a clock.
 VARIED = "this diagram, scan or set of fractions"
-
-
-class Family(eqx.Module):
-    """Oscillators by one parameter or two, linear in them: what programs know of a variation.
-
-    oscillator: the one at `origin`, [k]; slopes: of each of its leaves by the parameters, [k, ...],
-    None where a leaf is no number.
-    """
-
-    oscillator: Oscillator
-    slopes: tuple[Any, ...]
-    origin: Any
-
-    def at(self, p: Any) -> Oscillator:
-        """The oscillator at the parameters p, [k]."""
-        leaves, structure = jax.tree.flatten(self.oscillator)
-        known = is_concrete((self, p))
-        # What is known is taken apart in NumPy, which compiles nothing.
-        one: Any = np if known else jnp
-        shift = one.asarray(p) - one.asarray(self.origin)
-        for place, (leaf, slope) in enumerate(zip(leaves, self.slopes, strict=True)):
-            if slope is None or (is_concrete(slope) and not np.any(slope)):
-                continue
-            # An edge may be infinite, and a parameter NaN: that moves what depends on it only.
-            moves = [
-                one.where(row == 0, 0.0, row * by) for row, by in zip(slope, shift, strict=True)
-            ]
-            leaves[place] = jnp.asarray(sum(moves, start=one.asarray(leaf)))
-        return jax.tree.unflatten(structure, leaves)
-
-    @property
-    def units(self) -> Any:
-        """By how much each parameter changes where that number of the oscillator which changes
-        most does so by one, [k]: what parameters are measured in makes no difference to who asks.
-        """
-        slopes = [slope for slope in lax.stop_gradient(self.slopes) if slope is not None]
-        one: Any = np if is_concrete(slopes) else jnp
-        rows = [one.abs(one.reshape(slope, (len(slope), -1))) for slope in slopes]
-        rates = one.max(one.concatenate(rows, axis=1), axis=1)
-        return one.where(rates > 0, 1 / one.where(rates > 0, rates, 1.0), 1.0)
-
-    @property
-    def unit(self) -> Any:
-        """That of the last parameter."""
-        return self.units[-1]
-
-    def belt_slopes(self, belt: int, name: str) -> Any:
-        """Those of a number of a belt, [k]."""
-        slopes = jax.tree.unflatten(jax.tree.structure(self.oscillator), self.slopes)
-        return getattr(slopes.belts[belt], name)
-
-    def zeros(self, which: Sequence[tuple[int, str]]) -> list[float]:
-        """The value of the one parameter at which a number of a belt, (belt, name), is zero, or two
-        of them are equal; none where that does not change."""
-        at = [*(float(getattr(self.oscillator.belts[belt], name)) for belt, name in which), 0.0]
-        along = [*(float(self.belt_slopes(belt, name)[0]) for belt, name in which), 0.0]
-        if along[0] == along[1]:
-            return []
-        return [float(self.origin[0]) + (at[1] - at[0]) / (along[0] - along[1])]
 
 
 @dataclass(frozen=True)
@@ -470,11 +412,8 @@ class Variation:
         """The value, near `start`, of the one parameter, at which a belt is at rest."""
         value = float(start)
         for _ in range(PASSES):
-            family = self.family(np.array([value]))
-            velocity = family.at(np.array([value])).belts[belt].velocity
-            change = -float(velocity) / float(family.belt_slopes(belt, "velocity")[0])
-            value += change
-            if not abs(change) > ROUNDING:
+            before, (value,) = value, self.family(np.array([value])).zeros([(belt, "velocity")])
+            if not abs(value - before) > ROUNDING:
                 break
         return value
 

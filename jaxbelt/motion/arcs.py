@@ -34,6 +34,7 @@ from ..model.modes import (
 )
 from ..model.oscillator import Oscillator
 from ..model.transitions import directions, leave_slip, leave_stick, stick_phase
+from ..numerics.implicit import step_to_root
 from ..numerics.roots import first_root
 from .integrators import AbstractIntegrator, State, slip_field
 
@@ -150,21 +151,19 @@ def slip_arc(
     root, ended_by = _first_guard(osc, mode, signs, last, integrator, count)
     # Where not every extremum ends an arc nothing depends on where exactly one does.
     is_sharp = last.outside & (every_extremum | (ended_by < 3 * len(osc.belts)))
-    length = lax.stop_gradient(last.length)
 
     def guard_fired(*y):
         guards = _all_guards(osc, mode, signs, y)
         return jnp.sum(jnp.where(jnp.arange(guards.size) == ended_by, guards, 0.0))
 
-    # Newton steps from the root, small ones, for its last digits and for derivatives: two to second
-    # order. The third pass makes the state at the length that the second one found.
+    # Newton steps from the root, small ones, for its last digits. The third pass makes the state at
+    # the length that the second one found.
     def polish(carry, _):
         h = carry[0]
         y = integrator.step(functools.partial(slip_field, osc, mode), last.start, h)
         guard, slope = jax.jvp(guard_fired, y, slip_field(osc, mode, y))
-        regular = jnp.abs(slope) * 1e-3 * length > jnp.abs(lax.stop_gradient(guard))
-        shift = jnp.where(regular, guard / jnp.where(regular, slope, 1.0), 0.0)
-        return (h - jnp.where(is_sharp, shift, 0.0), h, y), None
+        regular = jnp.abs(slope) * 1e-3 * last.length > jnp.abs(guard)
+        return (h + step_to_root(guard, slope, where=is_sharp & regular), h, y), None
 
     h = jnp.where(last.outside, root, last.length)
     (_, h, y), _ = lax.scan(polish, (h, h, last.start), length=3)
@@ -172,8 +171,7 @@ def slip_arc(
 
 
 def _first_guard(osc, mode, signs, last, integrator, count) -> tuple[Array, Array]:
-    """When within the last step a guard first vanishes, and which; without derivatives."""
-    osc, mode, signs, last, integrator = lax.stop_gradient((osc, mode, signs, last, integrator))
+    """When within the last step a guard first vanishes, and which."""
     field = functools.partial(slip_field, osc, mode)
 
     def guards_at(y):

@@ -64,7 +64,7 @@ class AbstractIntegrator(eqx.Module):
 
         field: of the mode, also beyond its bounds. y: a state in the mode, or on a bound of it that
         the orbit moves away from. is_outside(y): a scalar, true beyond a bound of the mode. Returns
-        the last step, of which no end before was outside; with derivatives of its start by y.
+        the last step, of which no end before was outside.
         """
 
     def step(self, field: Field, y: State, h: Array) -> State:
@@ -142,8 +142,7 @@ class Adaptive(AbstractIntegrator):
         hit = jnp.asarray(hit)
         finished = hit | (t_end >= 1)
         t_start, t_end = self.span * t_start, self.span * t_end
-        last = lax.stop_gradient(t_end - t_start)
-        length = jnp.where(finished & ~hit, self.span - t_start, last)
+        length = jnp.where(finished & ~hit, self.span - t_start, t_end - t_start)
         return LastStep(t_start, tuple(start), length, tuple(end), hit, finished)
 
     def flow(self, field: Field, y: State) -> State:

@@ -38,6 +38,7 @@ from ..model.oscillator import Oscillator, has_clock, has_possible_numbers
 from ..model.rest import is_at_rest
 from ..model.transitions import at_focus, mode_of_state
 from ..numerics.compiling import any_lane, more_rows, of_lane, one_kernel, with_batches
+from ..numerics.derivatives import moving_and_fixed
 from ..numerics.padding import in_groups_of
 from ..results import Status
 from .arcs import ArcEnd, Signs, SlipArc, after_slip, signs_after, slip_arc, stick_arc
@@ -51,7 +52,6 @@ from .sensitivities import (
     in_one_row,
     parts_of_states,
     sensitivities,
-    split,
     with_derivatives,
 )
 from .timed import TimedArc, timed_arc
@@ -410,7 +410,7 @@ def _followed_by(rules: Rules) -> Callable:
 def _(primals, tangents):
     osc, y0, t0, t1, *_ = primals
     final, records, loop, samples = arcs_of_run(*primals)
-    varied, rest = split(osc, tangents[0])
+    varied, rest = moving_and_fixed(osc, tangents[0])
     used = ~jnp.isnan(records.event_t)
     behind = jnp.arange(1, used.size + 1)
     again = jnp.where(behind == loop.last, loop.loops, 0)

@@ -33,6 +33,8 @@ from ..model.oscillator import Oscillator, has_clock
 from ..model.rest import is_slow
 from ..model.transitions import on_guard
 from ..numerics.compiling import LARGEST, any_lane, axes_of, one_kernel
+from ..numerics.derivatives import moving_and_fixed
+from ..numerics.implicit import delay_of_root
 from ..numerics.padding import in_groups_of, longer
 from .arcs import stick_arc
 from .flights import (
@@ -102,8 +104,7 @@ def _passed(osc: Oscillator, arc: Arc, end: State, y: State, remaining: Array) -
 
     # By how much later than after `duration` the arc ends: nothing, with the right derivatives.
     slopes = slip_field(osc, mode, end)
-    guard, slope = jax.jvp(fired_guard, end, slopes)
-    late = (lax.stop_gradient(guard) - guard) / jnp.where(slope == 0, 1.0, slope)
+    late = delay_of_root(fired_guard, end, slopes)
     late = jnp.where(arc.in_time, remaining - arc.duration, late)
     x1, x2 = on_guard(osc, mode, arc.ended_by, end[0] + late * slopes[0], end[1] + late * slopes[1])
     slipped = x1, jnp.where(arc.captured, 0.0, x2), arc.duration + late
@@ -142,8 +143,7 @@ def _passed_in_time(
         guards = guards_at(osc, mode, (x1, x2, t))
         return jnp.sum(jnp.where(jnp.arange(guards.size) == arc.ended_by, guards, 0.0))
 
-    guard, slope = jax.jvp(fired_guard, known, field_at(osc, mode, known))
-    late = (lax.stop_gradient(guard) - guard) / jnp.where(slope == 0, 1.0, slope)
+    late = delay_of_root(fired_guard, known, field_at(osc, mode, known))
     late = jnp.where(arc.in_time, remaining - arc.duration, late)
     x1, x2, _ = on_guard_at(osc, mode, arc.ended_by, _later(osc, arc, known, late))
     return x1, jnp.where(arc.captured, 0.0, x2), arc.duration + late
@@ -163,19 +163,9 @@ def _creep(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> tuple[Array, Ar
     return ~mode.any_stuck & is_slow(x2, a), x2, a
 
 
-def split(osc: Oscillator, slopes) -> tuple[Oscillator, Oscillator]:
-    """The leaves of the oscillator that have a slope, and the others, each with None elsewhere."""
-    moves = jax.tree.map(lambda slope: slope is not None, slopes, is_leaf=_is_none)
-    return eqx.partition(osc, moves)
-
-
 def parts_of_states(states: Array) -> State:
     """The parts of states, [rows, parts]."""
     return tuple(states[:, i] for i in range(states.shape[1]))
-
-
-def _is_none(leaf) -> bool:
-    return leaf is None
 
 
 def in_one_row(*slopes) -> Array:
@@ -189,7 +179,8 @@ def in_one_row(*slopes) -> Array:
 def sensitivities(varied, rest, arcs: Arc, remaining: Array) -> Sensitivity:
     """Sensitivities of a run at the ends of its arcs, [arcs, inputs].
 
-    varied, rest: leaves of the oscillator, see `split`; remaining: the time from each entry to t1.
+    varied, rest: leaves of the oscillator, see `moving_and_fixed`; remaining: the time from each
+    entry to t1.
     Behind the arcs that were used nothing is told, but in the last row that of the last one.
     """
     return of_one_run(_sensitivities, varied, rest, arcs, remaining)
@@ -341,7 +332,7 @@ def _(primals, tangents):
     states = with_derivatives(*primals)
     if not states.size:
         return states, jnp.zeros(states.shape)
-    varied, rest = split(osc, along)
+    varied, rest = moving_and_fixed(osc, along)
     if entries_along is None:
         entries_along = jnp.zeros_like(entries)
     if since_along is None:

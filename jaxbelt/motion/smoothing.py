@@ -38,7 +38,7 @@ def switch_mode(osc: Oscillator, x1: Array, x2: Array, v_star: Array) -> Mode:
     hold together.
     """
     slip = contact(osc, x1, x2, rightward=True)
-    slip = Mode(tuple(jnp.where(code == STUCK, 1.0, code) for code in slip.codes))
+    slip = slip.slipping(1.0)
     mode = slip
     for belt in reversed(osc.belts):
         group = [

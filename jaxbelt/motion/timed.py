@@ -30,11 +30,10 @@ from ..model.instants import (
     carried,
     field_at,
     guard_sizes,
-    guards_at,
+    guards_trend,
     is_held_for_ever,
     on_guard_at,
     passed_guard,
-    trend_of,
 )
 from ..model.modes import Mode, select
 from ..model.oscillator import Oscillator, fastest
@@ -121,7 +120,7 @@ def first_vanishing(osc: Oscillator, mode: Mode, y: TimedState, longest: Array, 
     stuck = mode.any_stuck
 
     def look(y):
-        return _finite(trend_of(osc, mode, lambda y: guards_at(osc, mode, y), y))
+        return _finite(guards_trend(osc, mode, y))
 
     def unfinished(state: _March):
         going = (state.passed < longest) & ~state.hit & ~state.stops & ~state.failed

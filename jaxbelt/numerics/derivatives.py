@@ -10,6 +10,12 @@ import jax.flatten_util
 import jax.numpy as jnp
 
 
+def moving_and_fixed(tree: Any, tangents: Any) -> tuple[Any, Any]:
+    """The leaves that have a tangent, and those that have None, each with None elsewhere."""
+    has_one = jax.tree.map(lambda t: t is not None, tangents, is_leaf=lambda t: t is None)
+    return eqx.partition(tree, has_one)
+
+
 def forward_jacobian(fn: Callable[..., Any]) -> Callable[..., Any]:
     """`fn` with derivatives that come from its forward-mode Jacobian, in both modes.
 
@@ -21,9 +27,7 @@ def forward_jacobian(fn: Callable[..., Any]) -> Callable[..., Any]:
 
     @wrapped.def_jvp
     def _(primals, tangents):
-        perturbed, rest = eqx.partition(
-            primals, jax.tree.map(lambda t: t is not None, tangents, is_leaf=lambda t: t is None)
-        )
+        perturbed, rest = moving_and_fixed(primals, tangents)
         flat, unravel = jax.flatten_util.ravel_pytree(perturbed)
         flat_tangent, _ = jax.flatten_util.ravel_pytree(tangents)
 
@@ -62,16 +66,11 @@ def in_directions(
     """
     if not slopes:
         return function(*args), []
-    moving, fixed = eqx.partition(args, _is_there(slopes[0]))
+    moving, fixed = moving_and_fixed(args, slopes[0])
 
     def of_moving(moving):
         value = function(*eqx.combine(moving, fixed))
-        return eqx.partition(value, _is_there(differentiable(value)))
+        return moving_and_fixed(value, differentiable(value))
 
     changing, linear, others = jax.linearize(of_moving, moving, has_aux=True)
     return eqx.combine(changing, others), [linear(slope) for slope in slopes]
-
-
-def _is_there(tree: Any) -> Any:
-    """True in place of what is there, False in place of None."""
-    return jax.tree.map(lambda leaf: leaf is not None, tree, is_leaf=lambda leaf: leaf is None)

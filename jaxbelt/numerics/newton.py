@@ -1,7 +1,7 @@
-"""Newton's method, as one loop, and the implicit derivative of what it finds.
+"""Newton's method, as one loop; `implicit` has the derivatives of what it finds.
 
 For shooting, for conditions on an oscillator, and for the points of a curve. Where there are a few
-unknowns only, one step more costs nothing, gives the last digit, and carries the derivative: see
+unknowns only, one step more costs nothing, and gives the last digit: see
 `bifurcations.systems.small_newton`.
 
 Optimistix's Newton, handed the same matrices through a derivative rule, takes a sixth longer, and
@@ -9,7 +9,6 @@ gives back neither the lengths of its steps nor its last matrix, by which points
 and bound their errors.
 """
 
-import abc
 from collections.abc import Callable
 from typing import Any
 
@@ -20,6 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array
+
+from .implicit import Equations, solution
 
 #: Newton steps: five or six do from a guess that is good to the longest one, none from farther off.
 NEWTON_STEPS = 12
@@ -116,41 +117,6 @@ def newton(
     return eqx.tree_at(lambda n: n.z, solved, unravel(solved.z))
 
 
-class Equations(eqx.Module):
-    """As many equations as unknowns, for `solve`; what it is made of has no derivatives."""
-
-    @abc.abstractmethod
-    def residual(self, given: Any, z: Any) -> Array:
-        """The equations at the unknowns z, [n]."""
-
-    def linearized(self, given: Any, z: Any) -> tuple[Array, Array]:
-        """The equations, and their derivatives with respect to the n unknowns, [n, n]."""
-        flat, unravel = jax.flatten_util.ravel_pytree(z)
-
-        def of_flat(flat):
-            return self.residual(given, unravel(flat))
-
-        return of_flat(flat), jax.jacfwd(of_flat)(flat)
-
-    def moved(self, given: Any, z: Any, tangents: Any) -> tuple[Array, Array]:
-        """How fast the equations change as `given` moves by the tangents, None where it does not,
-        [n]; and their derivatives with respect to the unknowns, [n, n]."""
-        moving, fixed = moving_and_fixed(given, tangents)
-
-        def of_moving(moving):
-            return self.residual(eqx.combine(moving, fixed), z)
-
-        _, change = jax.jvp(of_moving, (moving,), (tangents,))
-        _, matrix = self.linearized(given, z)
-        return change, matrix
-
-
-def moving_and_fixed(given: Any, tangents: Any) -> tuple[Any, Any]:
-    """The leaves that have a tangent, and those that have None."""
-    has_one = jax.tree.map(lambda t: t is not None, tangents, is_leaf=lambda t: t is None)
-    return eqx.partition(given, has_one)
-
-
 def solve(
     equations: Equations, given: Any, start: Any, *, longest: float = LONGEST_NEWTON_STEP
 ) -> Newton:
@@ -164,18 +130,3 @@ def solve(
         newton(lambda z: equations.linearized(still, z), start, longest=longest)
     )
     return eqx.tree_at(lambda n: n.z, solved, solution(equations, given, solved.z))
-
-
-@eqx.filter_custom_jvp
-def solution(equations: Equations, given: Any, z: Any) -> Any:
-    """z, which solves the equations; differentiable with respect to `given`, as `solve` is."""
-    return z
-
-
-@solution.def_jvp
-def _(primals, tangents):
-    equations, given, z = primals
-    z = solution(equations, given, z)  # for derivatives of derivatives
-    shift, matrix = equations.moved(given, z, tangents[1])
-    _, unravel = jax.flatten_util.ravel_pytree(z)
-    return z, unravel(jnp.linalg.solve(matrix, -shift))

@@ -1,5 +1,6 @@
 """Arrays made longer: so that few shapes are compiled, or to be cut into groups of one size."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -13,6 +14,13 @@ from ..checks import pick
 def filled_up(tree: Any, rows: Any, size: int) -> Any:
     """Some rows of a tree of known arrays, filled up to `size` with the last of them."""
     return pick(tree, np.asarray(rows)[np.minimum(np.arange(size), len(rows) - 1)])
+
+
+def in_batches(tree: Any, rows: np.ndarray, size: int) -> Iterator[tuple[np.ndarray, Any]]:
+    """Some rows of a tree of known arrays in batches, `filled_up`, each with its rows' numbers."""
+    for first in range(0, len(rows), size):
+        batch = rows[first : first + size]
+        yield batch, filled_up(tree, batch, size)
 
 
 def longer(tree: Any, size: int, *, axis: int = 0, fill: int | float | None = None) -> Any:

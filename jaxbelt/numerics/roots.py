@@ -13,6 +13,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from .implicit import step_to_root
+
 #: The values of all guards at a time, and their rates of change.
 Guards = tuple[Array, Array]
 #: A root is found to this fraction of the step.
@@ -102,6 +104,4 @@ def _root(guards, which: Array, at_start: Guards, end: Array, at_end: Guards):
     f_start = jnp.where(f_start > JUST_LEFT, f_start, -f_end)
     start = (jnp.zeros_like(end), f_start, end, f_end, 0, end, at_end, 0)
     *_, c, at_c, _ = lax.while_loop(unfinished, improve, start)
-    value, slope = pick(at_c)
-    regular = near(at_c) & (slope != 0)
-    return c - jnp.where(regular, value / jnp.where(regular, slope, 1.0), 0.0), at_c
+    return c + step_to_root(*pick(at_c), where=near(at_c)), at_c

@@ -14,7 +14,8 @@ from matplotlib.axes import Axes
 from scipy.interpolate import Akima1DInterpolator
 
 from ..bifurcations.curves import BifurcationCurve
-from ..bifurcations.diagrams import BifurcationDiagram, Branch
+from ..bifurcations.diagrams import BifurcationDiagram
+from ..bifurcations.pieces import Branch
 from ..bifurcations.special import SpecialPoint
 from ..checks import require
 from ..cycles.cycle import Cycle

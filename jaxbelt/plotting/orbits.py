@@ -1,6 +1,6 @@
 """Orbit diagrams; zooming into one computes it anew."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -21,6 +21,17 @@ DOTS: dict[str, dict[str, Any]] = {
     "stuck": {"color": "#D55E00", "marker": ".", "label": "stuck for ever"},
     "undecided": {"color": "#CC79A7", "marker": "|", "label": "undecided"},
 }
+#: Colours of points found while the parameter falls, beside those found while it rises.
+FALLING = {"equilibrium": "#56B4E9", "cycle": "#E69F00", NOT_PERIODIC: "#F5CF80"}
+
+
+class _Dots(NamedTuple):
+    """A line with the points of a kind of attractor, from some starts, and its name in the key."""
+
+    kind: str
+    starts: tuple[int, ...]
+    label: str
+    line: Line2D
 
 
 def plot_orbits(
@@ -36,10 +47,10 @@ def plot_orbits(
     require_one_of(quantity, ("x1", "x2"), "quantity")
     require_value(isinstance(zoom, bool), "zoom", "True or False", zoom)
     ax = new_axes() if ax is None else ax
-    lines = {kind: _line(ax, kind) for kind in DOTS}
+    lines = _lines(ax, diagram)
     _put(lines, diagram, quantity)
-    for kind, line in lines.items():
-        ax.update_datalim(line.get_xydata(), updatey=kind != "undecided")
+    for one in lines:
+        ax.update_datalim(one.line.get_xydata(), updatey=one.kind != "undecided")
     ax.autoscale_view()
     ax.set_xlim(diagram.values[0], diagram.values[-1])
     ax.set(xlabel=parameter_label(diagram.name), ylabel=QUANTITIES[quantity])
@@ -48,16 +59,30 @@ def plot_orbits(
     return ax
 
 
-def _line(ax: Axes, kind: str) -> Line2D:
+def _lines(ax: Axes, diagram: OrbitDiagram) -> list[_Dots]:
+    """Lines without points; where the parameter rises and falls one of each kind for each sense."""
+    everywhere = tuple(range(diagram.kind.shape[1]))
+    both = diagram.sampling.senses == ("up", "down")
+    lines = []
+    for kind, look in DOTS.items():
+        if both and kind in FALLING:
+            falling = {"color": FALLING[kind], "label": f"{look['label']}, parameter falling"}
+            lines.append(_dots(ax, kind, (1,), **look | falling))
+            lines.append(_dots(ax, kind, (0,), **look))
+        else:
+            lines.append(_dots(ax, kind, everywhere, **look))
+    return lines
+
+
+def _dots(ax: Axes, kind: str, starts: tuple[int, ...], label: str, **look: Any) -> _Dots:
     place: dict[str, Any] = {"transform": ax.get_xaxis_transform()} if kind == "undecided" else {}
     size = 7.0 if kind == "undecided" else 2.5
-    (line,) = ax.plot([], [], linestyle="none", markersize=size, **place)
-    line.set(color=DOTS[kind]["color"], marker=DOTS[kind]["marker"])
-    return line
+    (line,) = ax.plot([], [], linestyle="none", markersize=size, **place, **look)
+    return _Dots(kind, starts, label, line)
 
 
 def _put(
-    lines: dict[str, Line2D],
+    lines: list[_Dots],
     diagram: OrbitDiagram,
     quantity: str,
     sizes: tuple[float, float] = (1.0, 1.0),
@@ -65,15 +90,16 @@ def _put(
     """Sets the points of each line, times the sizes; the key names the lines that have points."""
     heights = diagram.x1 if quantity == "x1" else diagram.x2
     values = np.broadcast_to(diagram.values[:, None, None], heights.shape)
-    for kind, line in lines.items():
-        of_kind = np.broadcast_to((diagram.kind == kind)[..., None], heights.shape)
+    for kind, starts, label, line in lines:
+        of_kind = (diagram.kind == kind) & np.isin(np.arange(diagram.kind.shape[1]), starts)
+        of_kind = np.broadcast_to(of_kind[..., None], heights.shape)
         if kind == "undecided":
             x = np.unique(values[of_kind])
             y = np.zeros_like(x)
         else:
             x, y = (one[of_kind & ~np.isnan(heights)] for one in (values, heights))
         line.set_data(x * sizes[0], y * sizes[1])
-        line.set_label(DOTS[kind]["label"] if len(x) else "_none")
+        line.set_label(label if len(x) else "_none")
 
 
 class _Zoom:
@@ -82,7 +108,7 @@ class _Zoom:
     While a button of the mouse is held, as in panning, it waits.
     """
 
-    def __init__(self, diagram: OrbitDiagram, ax: Axes, lines: dict[str, Line2D], quantity: str):
+    def __init__(self, diagram: OrbitDiagram, ax: Axes, lines: list[_Dots], quantity: str):
         self.diagram, self.ax, self.lines, self.quantity = diagram, ax, lines, quantity
         # Its position stays (1, 1) unless `plot_in_si` scales what is drawn.
         self.one = ax.text(1.0, 1.0, "")

@@ -29,6 +29,7 @@ from ..model.instants import field_at
 from ..model.modes import Mode, mode_acceleration
 from ..model.oscillator import Oscillator, at_time, has_clock
 from ..model.own_units import OwnOscillator
+from ..numerics.implicit import step_to_root
 from .moments import (
     PARTS_OF_STEP,
     AtEvents,
@@ -378,14 +379,8 @@ def _to_section(function, osc, lanes: Lanes, delta, low, high) -> Array:
     delta = lax.stop_gradient(delta)
     later = replace(lanes, t=lanes.t + delta) if has_clock(osc) else lanes
     value, rate = _seen(function, osc, later, *_moved(osc, lanes, delta))
-    step = -value / lax.stop_gradient(jnp.where(rate == 0, 1.0, rate))
-    step = jnp.where(rate == 0, 0.0, step)
+    step = step_to_root(value, lax.stop_gradient(rate))
     return lax.stop_gradient(jnp.clip(delta + step, low, high) - step) + step
-
-
-def _next(times: tuple[float, ...], passed: Array) -> Array:
-    """The next fixed time; inf when all are past."""
-    return jnp.asarray((*times, np.inf))[jnp.minimum(passed, len(times))]
 
 
 def _forces(osc: Oscillator, mode: Mode, x2: Array, residual: Array) -> list[Array]:

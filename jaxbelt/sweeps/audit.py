@@ -21,8 +21,8 @@ from ..model.pseudofocus import FOCUS_RADIUS
 from ..results import Status
 from .attractor import CYCLE, UNDECIDED
 from .observers import Final
-from .queue import by_name, layout
-from .threads import CHUNK, run
+from .runs_in_memory import results_of
+from .threads import CHUNK
 
 #: Largest difference of states and extrema, in tolerances of a step: errors add up over a run.
 AUDIT_CLOSE = 1e4
@@ -69,24 +69,13 @@ def differing(
 
 
 def _results(program, shared, rows: np.ndarray, numbers: dict[str, Any]) -> Results:
-    """The kernel's results for the rows, in their order."""
-    shapes = layout(program, shared)
+    """The kernel's results for the rows, [columns, runs]."""
+
+    def rows_of(first: int, last: int) -> np.ndarray:
+        return rows[None, :, first:last]
+
     runs = rows.shape[1]
-    columns = np.full((sum(map(math.prod, shapes.values())), runs), np.nan)
-
-    def put(done: np.ndarray, results: np.ndarray) -> None:
-        columns[:, done] = results[0]
-
-    run(
-        program,
-        shared,
-        lambda first, last: rows[None, :, first:last],
-        runs,
-        put,
-        **numbers,
-        budget=LONG_WAY_BUDGET,
-    )
-    return by_name(shapes, columns)
+    return results_of(program, shared, rows_of, runs, **numbers, budget=LONG_WAY_BUDGET)
 
 
 def _close(a: np.ndarray, b: np.ndarray, *, atol: float, rtol: float) -> np.ndarray:

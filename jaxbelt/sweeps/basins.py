@@ -34,7 +34,6 @@ from ..cycles.attractors import Runs
 from ..cycles.cycle import Cycle, cycle_from
 from ..cycles.periodic import PeriodicMotion
 from ..cycles.unstable import from_starts, unstable_cycle
-from ..kernel.lanes import Program
 from ..model.equilibria import EquilibriumKind, equilibria
 from ..model.oscillator import Oscillator, check_oscillator, has_clock, refuse_clock
 from ..model.own_units import in_given_units, in_own_units, in_units_of_run
@@ -44,11 +43,11 @@ from ..tables import table_of
 from .attractor import KINDS, Attractor
 from .datasets import decoded, flags
 from .forced_basins import forced_labels
-from .naming import Found, is_cycle, words_for
+from .naming import Found, is_cycle, told_apart, words_for
 from .question import LONG_ENOUGH, as_start, settings_of_runs
+from .runs_in_memory import results_from
 from .strobes import FORCED_KINDS, ForcedAttractor
 from .sweep import sweep
-from .work import results_of
 
 if TYPE_CHECKING:
     import pandas
@@ -364,13 +363,9 @@ def _forced_basins(osc: Oscillator, axes: Any, progress: Any, numbers: Any) -> B
     with Activity("basins", progress):
         dataset = sweep(lambda: osc, axes, observe="attractor", **numbers)
         note_progress("telling the attractors apart")
-        found = sorted(forced_labels(osc, dataset), key=_rarity)
+        found = forced_labels(osc, dataset)
     cycles = [one.cycle for one in found if one.cycle is not None]
     return _labelled(osc, dataset, found, cycles, None)
-
-
-def _rarity(one: Found) -> int:
-    return -int(np.sum(one.runs))
 
 
 def _labelled(
@@ -410,35 +405,26 @@ def _starts_along(values: Any, name: str) -> np.ndarray:
 
 
 def _labels(osc: Oscillator, dataset: "xarray.Dataset") -> list[Found]:
-    """The attractors that runs lead to, the most frequent first, their cycles in own units."""
+    """The attractors that runs lead to, see `told_apart`, their cycles in own units."""
     kinds = np.asarray(decoded(dataset[["kind"]])["kind"])
     sticks = np.asarray(dataset["sticks"]).astype(bool)
     low, high = np.asarray(dataset["x1_min"]), np.asarray(dataset["x1_max"])
     rest, held, _ = rest_reached(osc, 0.5 * (low + high))
     runs = Runs.of(dataset, ("x1", "x2"))
     own, length = in_own_units(osc, np.asarray(dataset.attrs["length"])), dataset.attrs["length"]
-    found: list[Found] = []
-    unlabelled = kinds != "undecided"
-    while np.any(unlabelled):
-        first = tuple(int(i) for i in np.unravel_index(np.argmax(unlabelled), unlabelled.shape))
-        kind, stuck = kinds[first], sticks[first]
-        same, cycle, before = unlabelled & (kinds == kind), None, None
+
+    def of_run(first: tuple[int, ...]) -> Found:
+        kind, stuck, cycle = kinds[first], sticks[first], None
         if kind == "cycle":
             start = np.array([dataset.x1[first[0]], dataset.x2[first[1]]]) / length
-            cycle = cycle_from(own, jnp.asarray(start))
-            # Runs that differ more than the accuracy of a sweep may still be on one cycle.
-            before = next((one for one in found if one.is_of(cycle)), None)
-            same &= runs.same(runs.at(first))[0]
+            cycle, same = cycle_from(own, jnp.asarray(start)), runs.same(runs.at(first))[0]
         else:
             # A mass that is stuck for ever may be anywhere on a segment.
             place = rest if kind == "equilibrium" else held
-            same &= np.all(sticks == stuck, axis=-1) & (place == place[first])
-        unlabelled &= ~same
-        if before is None:
-            found.append(Found(words_for(kind, stuck, rest[first], length), same, cycle))
-        else:
-            before.runs[same] = True
-    return sorted(found, key=_rarity)
+            same = np.all(sticks == stuck, axis=-1) & (place == place[first])
+        return Found(words_for(kind, stuck, rest[first], length), same, cycle)
+
+    return told_apart(kinds, of_run)
 
 
 #: Runs end no farther from the equilibrium that captures them, in own units.
@@ -549,13 +535,5 @@ def check_key(key: Any) -> None:
 
 def _kinds(osc: Oscillator, starts: np.ndarray, **numbers: Any) -> np.ndarray:
     """Numbers of the kinds of attractors for starts [2, n], in the order of the starts."""
-    leaves, structure = jax.tree.flatten(in_units_of_run(osc))
-    edges = bool(np.any([np.isfinite([belt.lower, belt.upper]) for belt in osc.belts]))
     observer = ForcedAttractor() if has_clock(osc) else Attractor()
-    program = Program(structure, (False,) * len(leaves), observer, edges)
-
-    def rows_of(first: int, last: int) -> np.ndarray:
-        return starts[None, :, first:last]
-
-    n = starts.shape[1]
-    return results_of(program, leaves, rows_of, n, **numbers)["kind"].astype(int)
+    return results_from(in_units_of_run(osc), observer, starts, **numbers)["kind"].astype(int)

@@ -29,12 +29,13 @@ from ..checks import (
     require_value,
 )
 from ..cycles.clocked import forcing_period, turns_of
-from ..cycles.periodic import PERIODS_AT_ONCE, PeriodicMotion, periodic_from
+from ..cycles.followed import PERIODS_AT_ONCE
+from ..cycles.periodic import PeriodicMotion, periodic_from
 from ..kernel.clocked import of_lanes
-from ..kernel.lanes import Observer, Program, Variable
+from ..kernel.lanes import Observer, Variable
 from ..model.forcing import Oscillating
 from ..model.instants import are_mates, field_at, is_faster
-from ..model.modes import BELOW, STUCK, Mode, capacity, edges, has_edges, mode_acceleration
+from ..model.modes import BELOW, STUCK, Mode, capacity, edges, mode_acceleration
 from ..model.oscillator import Oscillator, at_time, check_clock, check_oscillator
 from ..model.own_units import OwnOscillator, in_given_units, in_units_of_run
 from ..motion.arcs import Ends
@@ -42,8 +43,8 @@ from ..motion.simulate import SIMULATION_TOLERANCE, simulate
 from ..numerics.compiling import jit, power_of_two, where_any
 from ..results import Status, draw
 from ..tables import table_of
+from .runs_in_memory import results_from
 from .strobes import Growth, course_of_step, delay_of_event, grown, grown_past
-from .work import results_of
 
 if TYPE_CHECKING:
     import pandas
@@ -415,16 +416,10 @@ class _Mapping:
         return whole
 
     def _once(self, phases: np.ndarray) -> dict[str, np.ndarray]:
-        leaves, structure = jax.tree.flatten(self.own)
-        mapped, has_edge = (False,) * len(leaves), has_edges(self.own)
-        program = Program(structure, mapped, NextOnset(self.belt), has_edge, own_t0=True)
         t, states = self.states(phases)
-        rows = np.concatenate([np.asarray(self.own.units.length) * states, t[None]])[None]
-        found = results_of(
-            *(program, leaves, lambda first, last: rows[..., first:last], len(t)),
-            **self.numbers,
-            t1=(2 + self.periods) * self.period,
-        )
+        starts = np.concatenate([np.asarray(self.own.units.length) * states, t[None]])
+        t1 = (2 + self.periods) * self.period
+        found = results_from(self.own, NextOnset(self.belt), starts, **self.numbers, t1=t1)
         is_onset = found["sign"] == -self.limit
         turns, slope = (np.where(is_onset, found[name], np.nan) for name in ("elapsed", "slope"))
         return {"turns": turns / self.period, "slope": slope, "is_onset": is_onset}

@@ -11,11 +11,12 @@ import numpy as np
 
 from ..cycles.attractors import RUN, distance
 from ..cycles.clocked import turns_of
-from ..cycles.periodic import PERIODS_AT_ONCE, PeriodicMotion, nothing_found, periodic
+from ..cycles.followed import PERIODS_AT_ONCE
+from ..cycles.periodic import PeriodicMotion, nothing_found, periodic
 from ..model.oscillator import Oscillator
 from ..results import Status
 from .datasets import decoded
-from .naming import Found, words_for
+from .naming import Found, told_apart, words_for
 
 if TYPE_CHECKING:
     import xarray
@@ -27,33 +28,26 @@ OF_RUN = 1e-3
 
 
 def forced_labels(osc: Oscillator, dataset: "xarray.Dataset") -> list[Found]:
-    """The attractors that runs lead to, each with its runs."""
+    """The attractors that runs lead to, see `told_apart`."""
     kinds = np.asarray(decoded(dataset[["kind"]])["kind"])
     columns = [np.asarray(dataset[name]) for name in PLACES]
     places, periods = np.nan_to_num(np.stack(columns, axis=-1)), np.asarray(dataset["periods"])
     sticks = np.asarray(dataset["sticks"]).astype(bool)
-    error = RUN * float(dataset.attrs["rtol"])
-    found: list[Found] = []
-    unlabelled = kinds != "undecided"
-    while np.any(unlabelled):
-        first = tuple(int(i) for i in np.unravel_index(np.argmax(unlabelled), unlabelled.shape))
-        kind, stuck, motion, before = kinds[first], sticks[first], None, None
-        same = unlabelled & (kinds == kind) & np.all(sticks == stuck, axis=-1)
+    error, length = RUN * float(dataset.attrs["rtol"]), float(dataset.attrs["length"])
+
+    def of_run(first: tuple[int, ...]) -> Found:
+        kind, motion = kinds[first], None
+        same = np.all(sticks == sticks[first], axis=-1)
         if kind == "periodic":
             same &= periods == periods[first]
             same &= distance(places, places[first]) < error
             motion = _motion_near(osc, places[first], int(periods[first]))
-            before = next((one for one in found if one.is_of(motion)), None)
+            kind = f"{periods[first]}-periodic"
         elif kind == "equilibrium":
-            same &= distance(places, places[first], float(dataset.attrs["length"])) < error
-        unlabelled &= ~same
-        if before is None:
-            word = f"{periods[first]}-periodic" if kind == "periodic" else kind
-            name = words_for(word, stuck, places[first][0], float(dataset.attrs["length"]))
-            found.append(Found(name, same, motion))
-        else:
-            before.runs[same] = True
-    return found
+            same &= distance(places, places[first], length) < error
+        return Found(words_for(kind, sticks[first], places[first][0], length), same, motion)
+
+    return told_apart(kinds, of_run)
 
 
 def _motion_near(osc: Oscillator, place: np.ndarray, n: int) -> PeriodicMotion:

@@ -35,7 +35,6 @@ from .basins import as_box, check_key, rest_reached, standard_error, starts_in
 from .grid import Grid
 from .question import LONG_ENOUGH, settings_of_runs
 from .shares import numbers_of_attractors
-from .work import results_of
 
 if TYPE_CHECKING:
     import pandas
@@ -250,20 +249,15 @@ def _found_along(
     """Attractors at each value that its starts, [values, 2, n], lead to, the largest fraction
     first."""
     grid = Grid(lambda parameter: variation.make(parameter), {"parameter": values}, (0.0, 0.0))
-    program, n = grid.program(Attractor()), starts.shape[2]
+    n = starts.shape[2]
     error = error_of_runs(numbers, 1.0)
     found: list[list[_Met]] = []
     step = max(1, MOST_AT_ONCE // n)
     for first in range(0, len(values), step):
         part = starts[first : first + step]
-
-        def rows_of(begin: int, end: int, first=first, part=part) -> np.ndarray:
-            which, place = np.divmod(np.arange(begin, end), n)
-            return np.concatenate(
-                [part[which, :, place].T[None], grid.rows(first + which)[:, 2:]], axis=1
-            )
-
-        results = results_of(program, grid.shared, rows_of, len(part) * n, **numbers)
+        states = np.moveaxis(part, 1, 0).reshape(2, -1)
+        which = first + np.repeat(np.arange(len(part)), n)
+        results = grid.results(Attractor(), states, which, **numbers)
         note_progress("telling the attractors apart")
         for row in range(len(part)):
             here = {name: column[row * n : (row + 1) * n] for name, column in results.items()}

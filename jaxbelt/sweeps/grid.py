@@ -29,6 +29,7 @@ from ..model.oscillator import (
 )
 from ..model.own_units import in_units_of_run
 from ..numerics.compiling import jit, power_of_two
+from .runs_in_memory import results_of
 
 #: At least so many rows are made even for few runs, so that few shapes are compiled.
 FEWEST_ROWS = 2**14
@@ -100,6 +101,18 @@ class Grid:
     def program(self, observer: Observer) -> Program:
         made_of = fingerprint_or_unique((self.structure, observer))
         return Program(self.structure, self.mapped, observer, self.edges, made_of=made_of)
+
+    def results(
+        self, observer: Observer, states: np.ndarray, which: np.ndarray, **numbers: Any
+    ) -> dict[str, np.ndarray]:
+        """`results_of` runs from states, [2, runs]; which: the runs of the grid whose parameters
+        they have, [runs]."""
+
+        def rows_of(first: int, last: int) -> np.ndarray:
+            rows = self.rows(which[first:last])
+            return np.concatenate([states[None, :, first:last], rows[:, 2:]], axis=1)
+
+        return results_of(self.program(observer), self.shared, rows_of, len(which), **numbers)
 
     def length(self) -> float:
         """Smallest own unit of length among a sample of the oscillators of the grid."""

@@ -21,6 +21,7 @@ from ..checks import as_array, require, require_callable, require_one_of, requir
 from ..model.forcing import Oscillating
 from ..model.modes import Mode, mode_acceleration, without_rounding
 from ..model.oscillator import Oscillator, frequencies, has_clock
+from ..numerics.polynomials import derivative, polynomial, quintic
 from .observers import as_given
 
 
@@ -218,29 +219,25 @@ class Course(NamedTuple):
     @classmethod
     def of_step(cls, starts, ends, h: Array) -> "Course":
         """The quintic that has x1, x2 and x2' of both ends; starts, ends: these."""
-        (p0, v0, a0), (p1, v1, a1) = ((x1, h * x2, h * h * a) for x1, x2, a in (starts, ends))
-        d, e, f = p1 - p0 - v0 - 0.5 * a0, v1 - v0 - a0, a1 - a0
-        last = 10 * d - 4 * e + 0.5 * f, -15 * d + 7 * e - f, 6 * d - 3 * e + 0.5 * f
-        return cls((p0, v0, 0.5 * a0, *last), None, h)
+        start, end = ((x1, h * x2, h * h * a) for x1, x2, a in (starts, ends))
+        return cls(quintic(start, end), None, h)
 
     def velocity(self, theta) -> tuple[Array, Array]:
         """x2 within a step, and its derivative by theta."""
-        slopes = [k * c for k, c in enumerate(self.x1)][1:]
-        bends = [k * c for k, c in enumerate(slopes)][1:]
+        slopes = derivative(self.x1)
         h = jnp.where(self.duration > 0, self.duration, 1.0)
-        return _polynomial(slopes, theta) / h, _polynomial(bends, theta) / h
+        return polynomial(slopes, theta) / h, polynomial(derivative(slopes), theta) / h
 
     def sample(self, function, osc, mode, theta) -> tuple[Array, Array]:
         """Value of a section, and its derivative by theta."""
-        x1 = _polynomial(self.x1, theta)
-        slopes = [k * c for k, c in enumerate(self.x1)][1:]
+        x1, slope = (polynomial(one, theta) for one in (self.x1, derivative(self.x1)))
         if self.x2 is not None:
             x2, bend = self.x2, jnp.zeros_like(x1)
         else:
             x2, bend = self.velocity(theta)
-        state, tangents = (x1, x2), (_polynomial(slopes, theta), bend)
-        value, slope, *_ = jax.jvp(lambda x1, x2: function(osc, mode, x1, x2), state, tangents)
-        return value, slope
+        state, tangents = (x1, x2), (slope, bend)
+        value, rate, *_ = jax.jvp(lambda x1, x2: function(osc, mode, x1, x2), state, tangents)
+        return value, rate
 
 
 class Parts(NamedTuple):
@@ -307,7 +304,7 @@ def cut_of_step(side: Array, samples: Sequence[tuple[Array, Array]], h: Array, r
     for k in reversed(range(n)):
         cubic = _cubic(parts, k, 1 / n)
         extremum = _extremum_of(cubic)
-        least = parts.sides[k] * _polynomial(cubic, extremum)
+        least = parts.sides[k] * polynomial(cubic, extremum)
         place = (k + extremum) / n
         inside = (place > LEAST_CUT) & (place < 1 - LEAST_CUT)
         # The interpolant is not exact: a value that comes near to 0 may pass it.
@@ -320,7 +317,7 @@ def cut_of_step(side: Array, samples: Sequence[tuple[Array, Array]], h: Array, r
         found.append(here)
     assert picked is not None
     k, at_part, crosses, extremum, *cubic = picked
-    root = (k + _bisected(lambda theta: _polynomial(cubic, theta), at_part)) / n
+    root = (k + _bisected(lambda theta: polynomial(cubic, theta), at_part)) / n
     count = sum(here.astype(jnp.int32) for here in found)
 
     (g0, r0), (g1, r1) = samples[0], samples[-1]
@@ -407,13 +404,6 @@ def _extremum_of(cubic: Sequence[Array]) -> Array:
     divisor = jnp.sign(d0) * jnp.sqrt(jnp.maximum(c2 * c2 - 3 * c3 * d0, 0.0)) - c2
     safe = (d0 * d1 < 0) & (divisor != 0)
     return jnp.where(safe, jnp.clip(d0 / jnp.where(safe, divisor, 1.0), 0.0, 1.0), 1.0)
-
-
-def _polynomial(coefficients: Sequence[Array], theta: Array) -> Array:
-    total = jnp.zeros_like(theta)
-    for k in reversed(coefficients):
-        total = total * theta + k
-    return total
 
 
 def _bisected(function: Callable[[Array], Array], side: Array) -> Array:

@@ -1,6 +1,7 @@
 """Attractors that runs lead to, and the words for them."""
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +24,29 @@ class Found(NamedTuple):
         if isinstance(cycle, PeriodicMotion):
             return isinstance(self.cycle, PeriodicMotion) and is_same_motion(self.cycle, cycle)
         return isinstance(self.cycle, Cycle) and is_same(self.cycle, cycle)
+
+
+def told_apart(kinds: np.ndarray, of_run: Callable[[tuple[int, ...]], Found]) -> list[Found]:
+    """The attractors that runs lead to, each with its runs, the most frequent first.
+
+    kinds: of the runs; of_run: the attractor of a run, by its index, with the runs that are like
+    it, of whatever kind. Runs that differ more than the accuracy of a sweep may still be on one
+    cycle.
+    """
+    found: list[Found] = []
+    left = kinds != "undecided"
+    while np.any(left):
+        first = tuple(int(i) for i in np.unravel_index(np.argmax(left), left.shape))
+        one = of_run(first)
+        same = left & (kinds == kinds[first]) & one.runs
+        left &= ~same
+        known = (other for other in found if one.cycle is not None and other.is_of(one.cycle))
+        before = next(known, None)
+        if before is None:
+            found.append(one._replace(runs=same))
+        else:
+            before.runs[same] = True
+    return sorted(found, key=lambda one: -int(np.sum(one.runs)))
 
 
 def words_for(kind: str, sticks: np.ndarray, x1: float, length: float) -> str:

@@ -5,6 +5,9 @@ and its points at some moment (extrema, crossings of a section, events) are kept
 one as with `observe="attractor"`, so that each run takes the transient that it needs, and one that
 follows each cycle through one loop, from its largest displacement. The values of the parameter are
 data of both: other values compile nothing, and so a picture can be zoomed into.
+
+Where each value begins from what the one before has led to, as in an experiment, the first sweep is
+one value after the other, in a kernel of few lanes.
 """
 
 from collections import Counter
@@ -17,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from ..activity import announced
+from ..activity import announced, note_progress
 from ..checks import (
     as_array,
     as_interval,
@@ -26,6 +29,7 @@ from ..checks import (
     as_whole,
     check_finite,
     outside_of_traces,
+    require_one_of,
     require_value,
 )
 from ..cycles.attractors import RUN
@@ -36,13 +40,12 @@ from ..numerics.spacing import evenly_spaced
 from ..results import Status, draw
 from ..tables import table_of
 from .along import Along
-from .attractor import CYCLE, KINDS, UNDECIDED, Attractor
+from .attractor import CYCLE, EQUILIBRIUM, KINDS, UNDECIDED, Attractor
 from .grid import Grid
 from .moments import AtEvents, AtExtrema, AtPhase, AtSection
 from .question import LONG_ENOUGH
 from .reducers import check_sections
 from .strobes import SAME
-from .work import results_of
 
 if TYPE_CHECKING:
     import pandas
@@ -56,8 +59,16 @@ MOST_RUNS = 64
 #: A run through a loop goes on beyond it by this fraction of the period.
 OUTSIDE = 1e-4
 
-#: Of a forced oscillator: periods that are left out at first, and points that are kept.
-PERIODS_LEFT_OUT, STROBES = 1000, 64
+#: Of a forced oscillator: periods that are left out at first, fewer of them where a run begins on
+#: the attractor of a neighbouring value, and points that are kept.
+PERIODS_LEFT_OUT, PERIODS_LEFT_OUT_BESIDE, STROBES = 1000, 500, 64
+#: Lanes of a run that begins where another one has ended.
+FEW_LANES = 4
+#: Such a run begins so far from an equilibrium or a periodic forced motion, in own units: these may
+#: have become unstable, and a run that begins on one would stay.
+OFF_ATTRACTOR = 1e-3
+#: In which sense the parameter changes where runs begin so.
+SENSES = {"up": ("up",), "down": ("down",), "both": ("up", "down")}
 #: The kind of such points without a period: of chaos, of a torus, or of a slow approach.
 NOT_PERIODIC = "no period found"
 
@@ -160,6 +171,7 @@ def orbit_diagram(
     *,
     at: AtExtrema | AtSection | AtEvents | AtPhase | None = None,
     y0: ArrayLike | Sequence[Any] = (3.0, 0.0),
+    sense: str | None = None,
     rows: int = 400,
     rtol: ArrayLike = 1e-8,
     atol: ArrayLike | None = None,
@@ -180,6 +192,10 @@ def orbit_diagram(
             "x2", an `AtSection`, or `AtEvents`. Of a forced oscillator an `AtPhase` (None).
         y0: Start (x1, x2), or several, [starts, 2]: where attractors coexist, each start shows its
             own.
+        sense: "up", "down" or "both": the first value, or the last one, begins from `y0`, and each
+            other one from the attractor of the value before, as in an experiment in which the
+            parameter changes slowly; with "both", up is start 0 and down is start 1. None: each
+            value begins from `y0`.
         rows: Number of values of the parameter, evenly spaced.
         rtol: Relative tolerance of a step.
         atol: Absolute tolerance of a step; None: 1e-8 of the oscillator's own size.
@@ -197,6 +213,9 @@ def orbit_diagram(
     numbers = {"rtol": as_positive(rtol, "rtol"), "atol": as_tolerance(atol, "atol")}
     variation = varied(osc, where, (first,), forced=True)
     rows = as_whole(rows, "rows", 2)
+    if sense is not None:
+        require_one_of(sense, tuple(SENSES), "sense")
+        require_value(len(starts) == 1, "y0", "one start where sense is given", y0)
     example = variation.oscillator(np.array([first]))
     if has_clock(example):
         at = AtPhase() if at is None else at
@@ -206,7 +225,9 @@ def orbit_diagram(
         kinds = AtExtrema | AtSection | AtEvents
         require_value(isinstance(at, kinds), "at", "an AtExtrema, AtSection or AtEvents", at)
     check_sections((at,), example)
-    return Sampling(variation, at, starts, rows, numbers).diagram((first, last))
+    senses = () if sense is None else SENSES[sense]
+    starts = np.repeat(starts, len(senses), axis=0) if senses else starts
+    return Sampling(variation, at, starts, rows, numbers, senses).diagram((first, last))
 
 
 def _starts_of(y0: Any) -> np.ndarray:
@@ -224,13 +245,17 @@ def _starts_of(y0: Any) -> np.ndarray:
 @dataclass(frozen=True, eq=False)
 class Sampling:
     """Arguments that determine the points of an orbit diagram, except its span; see
-    `orbit_diagram`."""
+    `orbit_diagram`.
+
+    senses: in which sense the parameter changes, for each start; none: each value has the starts.
+    """
 
     variation: Variation
     at: Any
     starts: np.ndarray
     rows: int
     numbers: dict[str, Any]
+    senses: tuple[str, ...] = ()
 
     def diagram(self, span: tuple[float, float]) -> OrbitDiagram:
         """The orbit diagram over a span of the parameter."""
@@ -239,10 +264,9 @@ class Sampling:
             self.variation.check(value)
         values = evenly_spaced(first, last, self.rows)
         grid = Grid(self._make, {"parameter": values}, (0.0, 0.0))
-        shape = len(values), len(self.starts)
         if isinstance(self.at, AtPhase):
-            return self._strobed(grid, values, shape)
-        found = self._results(grid, Attractor(), np.tile(self.starts.T, len(values)), LONG_ENOUGH)
+            return self._strobed(grid, values)
+        found = self._from_starts(grid, Attractor(), _beside_attractor(grid), LONG_ENOUGH)
         # Codes of runs that are not finite are NaN.
         kind = np.nan_to_num(found["kind"]).astype(int)
         status = found["status"].astype(int)
@@ -256,32 +280,41 @@ class Sampling:
             missing = ((0, 0), (0, points[0].shape[1] - 1))
             x1, x2 = (np.pad(x, missing, constant_values=np.nan) for x in (x1, x2))
             x1[cycles], x2[cycles] = points
+        period = np.where(kind == CYCLE, found["period"], np.nan)
+        return self._diagram(values, np.array(KINDS)[kind], period, status, x1, x2)
+
+    def _diagram(self, values: np.ndarray, *columns: np.ndarray) -> OrbitDiagram:
+        """The diagram of columns of all runs: kind, period, status, and points x1 and x2."""
+        shape = len(values), len(self.starts)
+        kind, period, status = (column.reshape(shape) for column in columns[:3])
+        x1, x2 = (column.reshape(*shape, -1) for column in columns[3:])
         return OrbitDiagram(
             values=values,
-            kind=np.array(KINDS)[kind].reshape(shape),
-            period=np.where(kind == CYCLE, found["period"], np.nan).reshape(shape),
-            status=status.reshape(shape),
-            x1=x1.reshape(*shape, -1),
-            x2=x2.reshape(*shape, -1),
+            kind=kind,
+            period=period,
+            status=status,
+            x1=x1,
+            x2=x2,
             at=self.at,
             name=self.variation.names[0],
             sampling=self,
             is_argument=not self.variation.varies_leaves,
         )
 
-    def _strobed(self, grid: Grid, values: np.ndarray, shape: tuple[int, int]) -> OrbitDiagram:
+    def _strobed(self, grid: Grid, values: np.ndarray) -> OrbitDiagram:
         """The diagram of a stroboscopic section: STROBES points behind PERIODS_LEFT_OUT periods."""
         first = [float(frequencies(self._make(value))[0]) for value in values]
-        period = 2 * np.pi / np.repeat(first, shape[1])
-        t1 = float(np.max(period)) * (PERIODS_LEFT_OUT + STROBES + 1)
-        observer = Along(_Strobes((self.at,), PERIODS_LEFT_OUT, STROBES))
-        states = np.tile(self.starts.T, len(values))
-        found = self._results(grid, observer, states, t1, t0=0.0)
-        pieces = [f" {i}" for i in range(STROBES // 8)]
-        x1, x2 = (
-            np.concatenate([found[name + piece] for piece in pieces], axis=-1)
-            for name in ("x1", "x2")
-        )
+        period = 2 * np.pi / np.repeat(first, len(self.starts))
+        left_out = PERIODS_LEFT_OUT_BESIDE if self.senses else PERIODS_LEFT_OUT
+        t1 = float(np.max(period)) * (left_out + STROBES + 1)
+        reducer = _KeptMoments((self.at,), STROBES, ("x1", "x2"), left_out)
+        off = OFF_ATTRACTOR * grid.length()
+
+        def further(found):
+            return reducer.last_state(found) + off
+
+        found = self._from_starts(grid, Along(reducer), further, t1, t0=0.0)
+        x1, x2 = reducer.columns(found)
         # Runs of other frequencies may have a period less.
         status = found["status"].astype(int)
         good = (status == Status.OK) | (status == Status.STUCK_FOREVER)
@@ -291,18 +324,8 @@ class Sampling:
         kind = np.where(good, kind, KINDS[UNDECIDED])
         once = (turns[:, None] > 0) & (np.arange(STROBES) >= turns[:, None])
         x1, x2 = (np.where(once, np.nan, x) for x in (x1, x2))
-        return OrbitDiagram(
-            values=values,
-            kind=kind.reshape(shape),
-            period=np.where(turns > 0, turns * period, np.nan).reshape(shape),
-            status=status.reshape(shape),
-            x1=x1.reshape(*shape, -1),
-            x2=x2.reshape(*shape, -1),
-            at=self.at,
-            name=self.variation.names[0],
-            sampling=self,
-            is_argument=not self.variation.varies_leaves,
-        )
+        period = np.where(turns > 0, turns * period, np.nan)
+        return self._diagram(values, kind, period, status, x1, x2)
 
     def _make(self, parameter: Any) -> Oscillator:
         return self.variation.make(parameter)
@@ -314,17 +337,40 @@ class Sampling:
         states: np.ndarray,
         t1: float,
         which: Any = None,
-        t0: float | None = None,
+        **numbers: Any,
     ) -> dict[str, np.ndarray]:
-        """Results of an observer for runs from states, [2, runs]; which: their numbers, or all."""
+        """Results of an observer for runs from states, [2, runs]; which: their numbers, or all;
+        numbers: more of `threads.run`."""
         which = np.arange(states.shape[1]) if which is None else which
+        numbers |= {"t1": t1, **self.numbers}
+        return grid.results(observer, states, which // len(self.starts), **numbers)
 
-        def rows_of(first: int, last: int) -> np.ndarray:
-            rows = grid.rows(which[first:last] // len(self.starts))
-            return np.concatenate([states[None, :, first:last], rows[:, 2:]], axis=1)
-
-        numbers = {"t1": t1, "t0": t0, **self.numbers}
-        return results_of(grid.program(observer), grid.shared, rows_of, len(which), **numbers)
+    def _from_starts(
+        self,
+        grid: Grid,
+        observer: Any,
+        further: Callable[[dict[str, np.ndarray]], np.ndarray],
+        t1: float,
+        **numbers: Any,
+    ) -> dict[str, np.ndarray]:
+        """Results of an observer for all runs. Where the parameter changes in some sense,
+        `further` says of results where the next value begins, [2, runs], NaN: where they did."""
+        if not self.senses:
+            states = np.tile(self.starts.T, self.rows)
+            return self._results(grid, observer, states, t1, **numbers)
+        lanes, found = np.arange(len(self.senses)), {}
+        states = self.starts.T
+        for i in range(self.rows):
+            note_progress(f"{i} of {self.rows} values")
+            row = [i if sense == "up" else self.rows - 1 - i for sense in self.senses]
+            which = np.array(row) * len(lanes) + lanes
+            few = {"width": FEW_LANES, **numbers}
+            for name, values in self._results(grid, observer, states, t1, which, **few).items():
+                shape = self.rows * len(lanes), *values.shape[1:]
+                found.setdefault(name, np.full(shape, np.nan))[which] = values
+            ahead = further({name: values[which] for name, values in found.items()})
+            states = np.where(np.isfinite(ahead), ahead, states)
+        return found
 
     def _loops(self, grid: Grid, which: np.ndarray, x1_min, x1_max, period):
         """Status, x1 and x2 of the moments of one loop of cycles, [cycles] and [cycles, points].
@@ -355,16 +401,14 @@ class Sampling:
         loops are cut off, [cycles].
         """
         at = (AtExtrema("x1"),) if self.at == AtExtrema("x1") else (AtExtrema("x1"), self.at)
-        observer = Along(_LoopPoints(at, MOMENTS_KEPT))
+        reducer = _KeptMoments(at, MOMENTS_KEPT)
         moments, cut = np.zeros((4, len(which), 0)), np.zeros(len(which), bool)
         state, began = np.stack([x1_max, np.zeros_like(x1_max)]), np.zeros_like(x1_max)
         remaining = np.arange(len(which))
         for _ in range(MOST_RUNS):
             until = float(np.max((end - began)[remaining])) * (1 + OUTSIDE)
-            found = self._results(grid, observer, state[:, remaining], until, which[remaining])
-            pieces = [f" {i}" for i in range(-(-MOMENTS_KEPT // 8))]
-            columns = ([found[name + piece] for piece in pieces] for name in OF_MOMENTS)
-            new = np.stack([np.concatenate(one, axis=-1) for one in columns])
+            left = state[:, remaining], until, which[remaining]
+            new = np.stack(reducer.columns(self._results(grid, Along(reducer), *left)))
             new[0] += began[remaining, None]
             # Where the room is used up, the next run begins at the last extremum, if there is one.
             cut[remaining] = new[0, :, -1] < end[remaining]
@@ -385,6 +429,20 @@ class Sampling:
         return moments, cut
 
 
+def _beside_attractor(grid: Grid) -> Callable[[dict[str, np.ndarray]], np.ndarray]:
+    """Gives a state on the attractor of each run, [2, runs], or beside it, by its results."""
+    off = OFF_ATTRACTOR * grid.length()
+
+    def state(found: dict[str, np.ndarray]) -> np.ndarray:
+        kind = np.nan_to_num(found["kind"]).astype(int)
+        is_cycle, rests = kind == CYCLE, kind == EQUILIBRIUM
+        x1 = np.where(is_cycle, found["x1_max"], found["x1_min"] + np.where(rests, off, 0.0))
+        state = np.stack([x1, np.where(is_cycle, 0.0, found["x2_min"])])
+        return np.where(kind == UNDECIDED, np.nan, state)
+
+    return state
+
+
 def _turns_in(x1: np.ndarray, x2: np.ndarray) -> np.ndarray:
     """After how many points rows of them repeat, all of them, half as many at most; 0: not."""
     turns = np.zeros(len(x1), dtype=int)
@@ -395,73 +453,62 @@ def _turns_in(x1: np.ndarray, x2: np.ndarray) -> np.ndarray:
     return turns
 
 
-@dataclass(frozen=True)
-class _Strobes:
-    """The states at the moments of a run behind the first `skipped` ones, `room` of them, a
-    multiple of eight. A reducer, see `sweep.sweep`, as `_LoopPoints`."""
-
-    at: tuple[Any, ...]
-    skipped: int
-    room: int
-
-    def init(self, osc, x1, x2):
-        pieces = tuple(jnp.full(8, jnp.nan) for _ in range(self.room // 8))
-        return pieces, pieces, jnp.zeros((), int) - self.skipped
-
-    def update(self, state, event):
-        kept1, kept2, count = state
-
-        def put(value, pieces):
-            places = (8 * i + jnp.arange(8) for i in range(len(pieces)))
-            pairs = zip(places, pieces, strict=True)
-            return tuple(jnp.where(place == count, value, piece) for place, piece in pairs)
-
-        return put(event.x1, kept1), put(event.x2, kept2), count + 1
-
-    def finish(self, state, end):
-        pairs = zip(("x1", "x2"), state[:2], strict=True)
-        return {f"{name} {i}": piece for name, own in pairs for i, piece in enumerate(own)}
-
-
 #: Numbers of the moments of a loop: extrema of x1, and the moments of the diagram, if different.
 EXTREMUM, OWN = 0, 1
 #: Results of `Attractor` with the place of an attractor at rest.
 RESTS_AT = ("x1_min", "x2_min")
 
 
-@dataclass(frozen=True)
-class _LoopPoints:
-    """The first `room` moments of a run: t, x1, x2 and the number in `at`. A reducer, see
-    `sweep.sweep`.
+#: Moments are kept in pieces of so many: larger arrays in all lanes make a slow kernel.
+PIECE_KEPT = 8
 
-    They are kept in pieces of eight: larger arrays in all lanes make a slow kernel.
-    """
+
+@dataclass(frozen=True)
+class _KeptMoments:
+    """The first `room` moments of a run behind some that are skipped: of t, x1, x2 and the moment's
+    number in `at` those in `kept`. A reducer, see `sweep.sweep`; room: a multiple of PIECE_KEPT."""
 
     at: tuple[Any, ...]
     room: int
+    kept: tuple[str, ...] = ("t", "x1", "x2", "moment")
+    skipped: int = 0
+
+    @property
+    def pieces(self) -> range:
+        return range(self.room // PIECE_KEPT)
 
     def init(self, osc, x1, x2):
-        pieces = [jnp.full(min(8, self.room - k), jnp.nan) for k in range(0, self.room, 8)]
-        return (tuple(pieces),) * 4, jnp.zeros((), int)
+        pieces = tuple(jnp.full(PIECE_KEPT, jnp.nan) for _ in self.pieces)
+        return (pieces,) * len(self.kept), jnp.zeros((), int) - self.skipped
 
     def update(self, state, event):
-        kept, count = state
+        known, count = state
 
-        def put(value, pieces):
-            places = (8 * i + jnp.arange(piece.size) for i, piece in enumerate(pieces))
+        def put(name, pieces):
+            value = getattr(event, name).astype(event.t.dtype)
+            places = (PIECE_KEPT * i + jnp.arange(PIECE_KEPT) for i in self.pieces)
             pairs = zip(places, pieces, strict=True)
             return tuple(jnp.where(place == count, value, piece) for place, piece in pairs)
 
-        new = event.t, event.x1, event.x2, event.moment.astype(event.t.dtype)
-        return tuple(map(put, new, kept)), count + 1
+        return tuple(map(put, self.kept, known)), count + 1
 
     def finish(self, state, end):
         return {
             f"{name} {i}": piece
-            for name, pieces in zip(OF_MOMENTS, state[0], strict=True)
+            for name, pieces in zip(self.kept, state[0], strict=True)
             for i, piece in enumerate(pieces)
         }
 
+    def last_state(self, found: dict[str, np.ndarray]) -> np.ndarray:
+        """The last (x1, x2) that was kept of runs, [2, runs], NaN where there is none."""
+        x1, x2 = self.columns(found)
+        known = np.isfinite(x1)
+        last = self.room - 1 - np.argmax(known[:, ::-1], axis=1)
+        return np.stack([np.take_along_axis(x, last[:, None], 1)[:, 0] for x in (x1, x2)])
 
-#: Results for each moment.
-OF_MOMENTS = ("t", "x1", "x2", "number")
+    def columns(self, found: dict[str, np.ndarray]) -> list[np.ndarray]:
+        """What was kept of runs, [runs, room] each, from their results."""
+        return [
+            np.concatenate([found[f"{name} {i}"] for i in self.pieces], axis=-1)
+            for name in self.kept
+        ]

@@ -76,9 +76,26 @@ def attractors(
     require(starts, "dataset", "one with an axis x1 or x2 of starts", f"{dataset.kind.dims}")
     others = [name for name in dataset.kind.dims if name not in starts]
     order = (*others, *starts)
-    labels = _labels_of_starts(dataset, others, starts)
-    labels = _without_doubt(dataset, make, others, starts, labels)
     sizes = [dataset.sizes[name] for name in others]
+    runs = Runs.of(dataset, order)
+    shape = -1, int(np.prod([dataset.sizes[name] for name in starts]))
+    runs = replace(
+        runs, places=runs.places.reshape(*shape, 5), signatures=runs.signatures.reshape(shape)
+    )
+    kinds = dataset["kind"].transpose(*order).values.reshape(shape)
+    sticks = dataset["sticks"].transpose(*order, "belt").values.astype(bool)
+
+    def oscillator(point: int) -> Oscillator:
+        assert make is not None
+        place = dict(zip(others, np.unravel_index(point, sizes), strict=True))
+        here = dataset.isel({name: int(i) for name, i in place.items()})
+        given = (str(name) for name in here.coords if name not in NO_PARAMETERS)
+        numbers = {name: float(here[name]) for name in given}
+        return in_own_units(make(**numbers), np.asarray(dataset.attrs["length"]))
+
+    known = None if make is None else oscillator
+    labels = numbers_of_attractors(kinds, sticks.reshape(*kinds.shape, -1), runs, known)
+    labels = labels.reshape(*sizes, -1)
     count = int(labels.max(initial=0)) + 1
     numbers = np.arange(count)
     fractions = np.mean(labels[..., None] == numbers, axis=-2)
@@ -110,32 +127,6 @@ def _nothing(dtype: np.dtype) -> np.ndarray:
     return np.asarray(np.nan if np.issubdtype(dtype, np.floating) else 0, dtype)
 
 
-def _runs_by_points(dataset: "xarray.Dataset", others: list[str], starts: list[str]) -> Runs:
-    """Results of the runs, [points, starts]."""
-    runs = Runs.of(dataset, (*others, *starts))
-    shape = -1, int(np.prod([dataset.sizes[name] for name in starts]))
-    return replace(
-        runs, places=runs.places.reshape(*shape, 5), signatures=runs.signatures.reshape(shape)
-    )
-
-
-def _labels_of_starts(
-    dataset: "xarray.Dataset", others: list[str], starts: list[str]
-) -> np.ndarray:
-    """Numbers of the attractors, [.., starts], in the order in which they are met, or -1."""
-    runs = _runs_by_points(dataset, others, starts)
-    shape = runs.signatures.shape
-    kinds = dataset["kind"].transpose(*others, *starts).values.reshape(shape)
-    sticks = dataset["sticks"].transpose(*others, *starts, "belt").values.astype(bool)
-    sticks = sticks.reshape(*shape, -1)
-    labels = np.empty(shape, int)
-    step = max(1, AT_ONCE // shape[1])
-    for i in range(0, len(kinds), step):
-        part = slice(i, i + step)
-        labels[part] = _labels_of(kinds[part], sticks[part], runs.at((part,)))
-    return labels.reshape(*(dataset.sizes[name] for name in others), -1)
-
-
 def _labels_of(kinds: np.ndarray, sticks: np.ndarray, runs: Runs) -> np.ndarray:
     """Numbers of the attractors, [points, starts], or -1.
 
@@ -160,7 +151,10 @@ def _labels_of(kinds: np.ndarray, sticks: np.ndarray, runs: Runs) -> np.ndarray:
 
 
 def numbers_of_attractors(
-    kinds: np.ndarray, sticks: np.ndarray, runs: Runs, oscillator: Callable[[int], Oscillator]
+    kinds: np.ndarray,
+    sticks: np.ndarray,
+    runs: Runs,
+    oscillator: Callable[[int], Oscillator] | None,
 ) -> np.ndarray:
     """Numbers of the attractors of the runs at each point, in the order in which they are met, or
     -1.
@@ -174,46 +168,22 @@ def numbers_of_attractors(
     Returns:
         The numbers, [points, runs].
     """
-    labels = _labels_of(kinds, sticks, runs)
-    for point, pairs in _doubts(kinds, labels, runs).items():
+    labels = np.empty(kinds.shape, int)
+    step = max(1, AT_ONCE // kinds.shape[1])
+    for i in range(0, len(kinds), step):
+        part = slice(i, i + step)
+        labels[part] = _labels_of(kinds[part], sticks[part], runs.at((part,)))
+    doubts = _doubts(kinds, labels, runs)
+    if doubts and oscillator is None:
+        needed = "given, the function of the sweep, for cycles that only shooting tells apart"
+        require(False, "make", needed, f"None; there are such at {len(doubts)} points")
+    for point, pairs in doubts.items():
+        assert oscillator is not None
         labels[point] = _decided(oscillator(point), labels[point], runs.places[point], pairs)
     return labels
 
 
 # --- cycles that the runs do not distinguish ------------------------------------------------------
-
-
-def _without_doubt(
-    dataset: "xarray.Dataset",
-    make: Callable[..., Oscillator] | None,
-    others: list[str],
-    starts: list[str],
-    labels: np.ndarray,
-) -> np.ndarray:
-    """The numbers of `_labels_of_starts`, where shooting has decided which are of one cycle."""
-    runs = _runs_by_points(dataset, others, starts)
-    flat = labels.reshape(runs.signatures.shape).copy()
-    kinds = dataset["kind"].transpose(*others, *starts).values.reshape(flat.shape)
-    doubts = _doubts(kinds, flat, runs)
-    if not doubts:
-        return labels
-    require(
-        make is not None,
-        "make",
-        "given, the function of the sweep, for cycles that only shooting tells apart",
-        f"None; there are such at {len(doubts)} points",
-    )
-    assert make is not None
-    sizes = [dataset.sizes[name] for name in others]
-    for point, pairs in doubts.items():
-        place = dict(zip(others, np.unravel_index(point, sizes), strict=True))
-        here = dataset.isel({name: int(i) for name, i in place.items()})
-        given = (str(name) for name in here.coords if name not in NO_PARAMETERS)
-        osc = in_own_units(
-            make(**{name: float(here[name]) for name in given}), np.asarray(dataset.attrs["length"])
-        )
-        flat[point] = _decided(osc, flat[point], runs.places[point], pairs)
-    return flat.reshape(labels.shape)
 
 
 def _decided(

@@ -34,6 +34,7 @@ from ..model.modes import Mode, mode_acceleration
 from ..model.oscillator import at_time, frequencies
 from ..model.own_units import OwnOscillator
 from ..numerics.compiling import where_any
+from ..numerics.implicit import step_to_root
 from ..results import Status
 from .attractor import EQUILIBRIUM, STUCK_FOR_EVER, UNDECIDED, Attractor
 from .moments import LEAST_CUT, Course
@@ -480,8 +481,8 @@ def _strobe_period(osc: OwnOscillator, turns: Array) -> Array:
 
 def _way_to_zero(value: Array, slope: Array, h: Array) -> Array:
     """Time to where a value vanishes, 0 where that is farther than `NEAR_EXTREMUM`."""
-    way = -value / jnp.where(slope == 0, 1.0, slope)
-    return jnp.where((slope != 0) & (jnp.abs(way) <= NEAR_EXTREMUM) & (h > 0), way, 0.0)
+    way = step_to_root(value, slope)
+    return jnp.where((jnp.abs(way) <= NEAR_EXTREMUM) & (h > 0), way, 0.0)
 
 
 # --- tangents -------------------------------------------------------------------------------------
@@ -578,5 +579,4 @@ def delay_of_event(osc: OwnOscillator, before: Mode, number: Array, y, d) -> Arr
 
     _, moved = jax.jvp(guard, y, (*d, jnp.zeros_like(d[0])))
     _, slope = jax.jvp(guard, y, field_at(osc, before, y))
-    late = -moved / jnp.where(slope == 0, 1.0, slope)
-    return jnp.where(slope == 0, 0.0, late)
+    return step_to_root(moved, slope)

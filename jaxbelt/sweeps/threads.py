@@ -81,6 +81,7 @@ def run(
     derivatives: int = 0,
     budget: float = 1.0,
     threads: int | None = None,
+    width: int | None = None,
     watch: Callable[[], None] = lambda: None,
 ) -> None:
     """Does all runs, on `threads` threads or, with None, on all cores.
@@ -106,6 +107,7 @@ def run(
         derivatives: Number of directions of derivatives.
         budget: Share of `STEP_BUDGET` that a run may take.
         threads: Number of threads.
+        width: Number of lanes of each thread; None: by the number of runs.
         watch: Called every tenth of a second.
     """
     if not runs:
@@ -118,7 +120,7 @@ def run(
     threads = workers() if threads is None else threads
     columns = program.columns
     atol = np.nan if atol is None else atol
-    width = lanes_for(-(-runs // threads))
+    width = lanes_for(-(-runs // threads)) if width is None else width
     most = CHUNK.here * width // WIDTH.here
     team = _Team(
         functools.partial(compiled(program), Common(shared, t1, rtol, atol, np.int32(limit), t0)),

@@ -1,16 +1,13 @@
 """The work of a sweep: runs through the kernel, by blocks into memory or a store, or one by one."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array
 
-from ..kernel.lanes import Program
 from .datasets import Memory
 from .question import Question
-from .queue import by_name, column_of, layout
+from .queue import column_of
 from .store import Store
 from .threads import run
 
@@ -61,29 +58,6 @@ def do_runs(
         derivatives=len(question.derivatives),
         **options,
     )
-
-
-def results_of(
-    program: Program,
-    shared: list[Array],
-    rows_of: Callable[[int, int], np.ndarray],
-    runs: int,
-    *,
-    t1: float,
-    rtol: float,
-    atol: float | None,
-    t0: float | None = None,
-) -> dict[str, np.ndarray]:
-    """Results of runs by name, [runs, ...], in the order of the runs; arguments as for
-    `threads.run`."""
-    shapes = layout(program, shared)
-    columns = np.zeros((sum(math.prod(shape) for shape in shapes.values()), runs))
-
-    def put(places: np.ndarray, results: np.ndarray) -> None:
-        columns[:, places] = results[0]
-
-    run(program, shared, rows_of, runs, put, t1=t1, rtol=rtol, atol=atol, t0=t0)
-    return by_name(shapes, columns)
 
 
 def counts(statuses: np.ndarray) -> dict[int, int]:

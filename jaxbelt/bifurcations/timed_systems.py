@@ -1,0 +1,164 @@
+"""Systems of a periodic motion of a forced oscillator and one condition, see `forced`."""
+
+import functools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..cycles.chains import first_failure
+from ..cycles.clocked import (
+    TimedChain,
+    monodromy,
+    monodromy_and_slopes,
+    sticks_in,
+    timed_blocks,
+    timed_chain,
+    timed_residual,
+)
+from ..cycles.periodic import (
+    PeriodicMotion,
+    extrema_of,
+    motion_at,
+)
+from ..cycles.shooting import jacobian
+from ..model.instants import guards_trend
+from ..model.modes import capacity, mode_acceleration, mode_of
+from ..model.oscillator import Oscillator, at_time
+from ..results import Status
+from .systems import PARTS_OF_ARC, AbstractChainSystem, Seen
+
+#: A multiplier that is off by less is the one that the condition asks for.
+ON_CIRCLE = 1e-6
+
+
+class TimedSystem(AbstractChainSystem):
+    """A condition on a periodic motion; the unknowns are those of the motion, [N, 4]."""
+
+    def condition(self, osc: Oscillator, z: Array) -> Array:
+        """What vanishes there."""
+        raise NotImplementedError
+
+    def condition_and_slopes(self, osc_of: Any, z: Array, p: Array) -> Any:
+        """The condition at the parameters p, and its derivatives by z and p."""
+        return jax.value_and_grad(lambda z, p: self.condition(osc_of(p), z), (0, 1))(z, p)
+
+    def judge(self, osc: Oscillator, motion: PeriodicMotion) -> Array:
+        """The status of a solution."""
+        return motion.status
+
+    def residual(self, osc, x):
+        value = timed_residual(osc, self.chain, x)
+        return jnp.append(value.reshape(-1), self.condition(osc, x))
+
+    def linearized(self, osc_of, x, p):
+        osc, along = osc_of(p), jax.jacfwd(osc_of)(p)
+        value, blocks = timed_blocks(osc, along, self.chain, x)
+        last, (by_z, by_p) = self.condition_and_slopes(osc_of, x, p)
+        by_parameter = blocks[..., 4:].reshape(-1, p.size)
+        rows = jnp.concatenate([jacobian(blocks[..., :4]), by_parameter], axis=1)
+        row = jnp.append(by_z.reshape(-1), by_p)
+        return jnp.append(value.reshape(-1), last), jnp.concatenate([rows, row[None]])
+
+    def seen_at(self, osc, x):
+        error = jnp.max(jnp.abs(self.residual(osc, x)))
+        motion = motion_at(osc, self.chain, x, error, jnp.asarray(0), jnp.asarray(0))
+        exists = (motion.status == Status.OK) & (self.judge(osc, motion) == Status.OK)
+        return Seen({}, exists, jnp.real(motion.multipliers[0]), error)
+
+    def place(self, osc, x):
+        none = jnp.full(2, jnp.nan, complex)
+        numbers = jnp.zeros(()), jnp.asarray(0), jnp.asarray(Status.OK.value)
+        return place_of_motion(PeriodicMotion(osc, self.chain, jnp.asarray(x), none, *numbers))
+
+    def remeshed(self, osc, x):
+        # The mesh has been refined, and will be once more.
+        size = self.chain.mesh.shape[-1] // PARTS_OF_ARC
+        chain, _ = timed_chain(osc, self.chain.loop(x), size, self.chain.turns)
+        return eqx.tree_at(lambda system: system.chain, self, chain).refined(osc, x)
+
+    def error_of_steps(self, osc, x):
+        values = self.chain.on_both_meshes(lambda chain: timed_residual(osc, chain, x))
+        return jnp.max(jnp.abs(values[0] - values[1]), axis=-1)
+
+
+class OnUnitCircle(TimedSystem):
+    """weights[0] + weights[1] trace + weights[2] determinant of the monodromy matrix vanishes.
+
+    weights: (1, 1, 1) a multiplier -1, (1, -1, 1) a multiplier 1, (-1, 0, 1) a determinant of 1.
+    """
+
+    chain: TimedChain
+    parts: Array
+
+    def _of(self, matrix: Array) -> Array:
+        trace = matrix[0, 0] + matrix[1, 1]
+        det = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
+        det = jnp.where(sticks_in(self.chain), 0.0, det)
+        return self.parts[0] + self.parts[1] * trace + self.parts[2] * det
+
+    def condition(self, osc, z):
+        return self._of(monodromy(osc, self.chain, z))
+
+    def condition_and_slopes(self, osc_of, z, p):
+        along = jax.jacfwd(osc_of)(p)
+        matrix, by_z, by_p = monodromy_and_slopes(osc_of(p), along, self.chain, z)
+        value, by_matrix = jax.value_and_grad(self._of)(matrix)
+        contracted = functools.partial(jnp.tensordot, by_matrix, axes=2)
+        return value, (contracted(by_z), contracted(by_p))
+
+    def judge(self, osc, motion):
+        # -1 or 1 where the trace counts; else a pair.
+        wanted = jnp.where(self.parts[1] > 0, -1.0, 1.0)
+        found = motion.multipliers
+        is_there = jnp.min(jnp.abs(found - wanted.astype(complex))) < ON_CIRCLE
+        is_pair = jnp.abs(jnp.imag(found[0])) > ON_CIRCLE
+        fits = jnp.where(self.parts[1] == 0, is_pair, is_there)
+        return first_failure(motion.status, fits, Status.OTHER_KIND)
+
+
+class Touching(TimedSystem):
+    """r = 0 at the end of the arc `row`, at which r' = 0."""
+
+    chain: TimedChain
+    row: Array
+    belt: Array
+
+    def condition(self, osc, z):
+        y = z[self.row + 1]
+        velocities = jnp.stack([belt.velocity for belt in at_time(osc, y[2]).belts])
+        return velocities[self.belt] - osc.omega * y[1]
+
+
+class AtLimit(TimedSystem):
+    """The force that stuck belts need is what they can hold at the end of the arc `row`.
+
+    codes: of the mode in which they stick; rises: 1 where that force is to rise there, -1 where it
+    is to fall, 0 where it may do either.
+    """
+
+    chain: TimedChain
+    row: Array
+    codes: Array
+    rises: Array
+
+    def condition(self, osc, z):
+        y, mode = z[self.row + 1], mode_of(self.codes)
+        now = at_time(osc, y[2])
+        return jnp.abs(mode_acceleration(now, mode, y[0], y[1])) - capacity(now, mode)
+
+    def judge(self, osc, motion):
+        mode, y = mode_of(self.codes), motion.unknowns[self.row + 1]
+        at = guards_trend(osc, mode, y)
+        rises = -jnp.where(at.value[-2] < at.value[-1], at.slope[-2], at.slope[-1])
+        return first_failure(motion.status, self.rises * rises >= 0, Status.OTHER_KIND)
+
+
+def place_of_motion(motion: PeriodicMotion) -> np.ndarray:
+    """Smallest and largest x1, the same of x2, and the period, [5]."""
+    if int(motion.status) != Status.OK:
+        return np.full(5, np.nan)
+    return np.append(np.asarray(extrema_of(motion)), float(motion.period))

@@ -1,0 +1,29 @@
+"""Polynomials by their coefficients, that of the power 0 first."""
+
+from collections.abc import Sequence
+
+from jaxtyping import Array
+
+#: A value, and its first two derivatives.
+Jet = tuple[Array, Array, Array]
+
+
+def polynomial(coefficients: Sequence[Array], x: Array) -> Array:
+    """The value at x, by Horner's rule."""
+    total = coefficients[-1]
+    for one in reversed(coefficients[:-1]):
+        total = total * x + one
+    return total
+
+
+def derivative(coefficients: Sequence[Array]) -> list[Array]:
+    """The coefficients of the derivative."""
+    return [k * one for k, one in enumerate(coefficients)][1:]
+
+
+def quintic(start: Jet, end: Jet) -> tuple[Array, ...]:
+    """The coefficients of the quintic that has these values and derivatives at 0 and at 1."""
+    (p0, v0, a0), (p1, v1, a1) = start, end
+    d, e, f = p1 - p0 - v0 - 0.5 * a0, v1 - v0 - a0, a1 - a0
+    last = 10 * d - 4 * e + 0.5 * f, -15 * d + 7 * e - f, 6 * d - 3 * e + 0.5 * f
+    return p0, v0, 0.5 * a0, *last
