@@ -33,6 +33,7 @@ from ..checks import (
     require_value,
     traceable,
 )
+from ..dimensions import quantity
 
 
 def _number_named(name: str) -> Callable[[Any], Array]:
@@ -148,7 +149,9 @@ class ForceInUnits(AbstractForce):
 class ConstantForce(AbstractForce):
     """A constant force, as of an incline: a `Harmonic` with the frequency 0. No clock."""
 
-    amplitude: Float[Array, ""] = eqx.field(converter=_number_named("amplitude"))
+    amplitude: Float[Array, ""] = eqx.field(
+        converter=_number_named("amplitude"), metadata=quantity("force")
+    )
 
     def __init__(self, amplitude: ArrayLike):
         self.amplitude = amplitude  # pyright: ignore[reportAttributeAccessIssue]
@@ -174,9 +177,15 @@ class ConstantForce(AbstractForce):
 class _Sinusoid(AbstractForce):
     """A force of one wave, by its amplitude, frequency and phase."""
 
-    amplitude: Float[Array, ""] = eqx.field(converter=_number_named("amplitude"))
-    frequency: Float[Array, ""] = eqx.field(converter=_number_named("frequency"))
-    phase: Float[Array, ""] = eqx.field(converter=_number_named("phase"), default=0.0)
+    amplitude: Float[Array, ""] = eqx.field(
+        converter=_number_named("amplitude"), metadata=quantity("force")
+    )
+    frequency: Float[Array, ""] = eqx.field(
+        converter=_number_named("frequency"), metadata=quantity("frequency")
+    )
+    phase: Float[Array, ""] = eqx.field(
+        converter=_number_named("phase"), default=0.0, metadata=quantity("angle")
+    )
 
     def __check_init__(self):
         self.check(type(self).__name__)
@@ -227,6 +236,10 @@ class BaseMotion(_Sinusoid):
         ValueError: If an argument is impossible; the message names it.
     """
 
+    amplitude: Float[Array, ""] = eqx.field(
+        converter=_number_named("amplitude"), metadata=quantity("length")
+    )
+
     def bound(self, damping: ArrayLike) -> Array:
         return jnp.abs(self.amplitude) * jnp.sqrt(1 + (damping * self.frequency) ** 2)
 
@@ -256,10 +269,15 @@ class Oscillating(_Wave):
         ValueError: If an argument is impossible; the message names it.
     """
 
+    # Mean and amplitude have the dimension of what oscillates.
     mean: Float[Array, ""] = eqx.field(converter=_number_named("mean"))
     amplitude: Float[Array, ""] = eqx.field(converter=_number_named("amplitude"))
-    frequency: Float[Array, ""] = eqx.field(converter=_number_named("frequency"))
-    phase: Float[Array, ""] = eqx.field(converter=_number_named("phase"), default=0.0)
+    frequency: Float[Array, ""] = eqx.field(
+        converter=_number_named("frequency"), metadata=quantity("frequency")
+    )
+    phase: Float[Array, ""] = eqx.field(
+        converter=_number_named("phase"), default=0.0, metadata=quantity("angle")
+    )
 
     def __check_init__(self):
         self.check("Oscillating")

@@ -49,6 +49,7 @@ from ..checks import (
     require_own_threads,
     require_value,
 )
+from ..dimensions import quantity
 from ..numerics.compiling import traced_once
 from .forcing import AbstractForce, ConstantForce, Oscillating, as_forcing, as_load, as_velocity
 from .friction import AbstractFriction, as_friction
@@ -120,14 +121,18 @@ class Belt(eqx.Module):
     """
 
     # A scalar array, or `Oscillating`.
-    velocity: Any = eqx.field(converter=as_velocity)
+    velocity: Any = eqx.field(converter=as_velocity, metadata=quantity("velocity"))
     friction: AbstractFriction = eqx.field(converter=as_friction)
-    load: Any = eqx.field(converter=as_load, default=1.0)
+    load: Any = eqx.field(converter=as_load, default=1.0, metadata=quantity("force"))
     lower: Float[Array, ""] = eqx.field(
-        converter=lambda value: as_edge(value, "lower"), default=-float("inf")
+        converter=lambda value: as_edge(value, "lower"),
+        default=-float("inf"),
+        metadata=quantity("length"),
     )
     upper: Float[Array, ""] = eqx.field(
-        converter=lambda value: as_edge(value, "upper"), default=float("inf")
+        converter=lambda value: as_edge(value, "upper"),
+        default=float("inf"),
+        metadata=quantity("length"),
     )
 
     def __check_init__(self):
@@ -204,7 +209,9 @@ class Oscillator(eqx.Module):
         ValueError: If a value is impossible; the message names it.
     """
 
-    damping: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "damping"))
+    damping: Float[Array, ""] = eqx.field(
+        converter=lambda value: as_array(value, "damping"), metadata=quantity("damping")
+    )
     belts: tuple[Belt, ...] = eqx.field(converter=as_belts)
     omega: Float[Array, ""] = eqx.field(
         converter=lambda value: as_array(value, "omega"), default=1.0

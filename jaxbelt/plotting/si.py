@@ -21,7 +21,9 @@ from ..bifurcations.diagrams import BifurcationDiagram
 from ..checks import require
 from ..cycles.functionals import MEASURED_IN
 from ..model.machine import Units
-from ..si import SYMBOLS, AlongParameter, check_machine, rest_in_m, units_along, units_of
+from ..model.si_units import SI_UNITS
+from ..si import AlongParameter, check_machine, units_along, units_of
+from ..sweeps.naming import rest_in_m
 from .draw import draw_result
 from .style import figure_of, in_fractions, parameter_label, require_axes
 
@@ -137,11 +139,11 @@ def _units_of_picture(result: Any, machine: Any) -> tuple[Units, tuple[float, st
 
 def _relabel_key(ax: Axes, units: Units) -> None:
     for artist in ax.get_children():
-        if (words := rest_in_m(label := str(artist.get_label()), units)) != label:
+        if (words := rest_in_m(label := str(artist.get_label()), units.length)) != label:
             artist.set_label(words)
     for key in [ax.get_legend(), *figure_of(ax).legends]:
         for text in key.get_texts() if key else ():
-            words = rest_in_m(text.get_text(), units)
+            words = rest_in_m(text.get_text(), units.length)
             text.set_text(words.replace("$x_1$", "$X$").replace("$x_2$", r"$\dot X$"))
 
 
@@ -193,8 +195,8 @@ def _convert_functional(
     elif (quantity := known[0]) != "number":
         if quantity == "coordinate":
             quantity = {"x1": "length", "x2": "velocity"}[coordinate]
-        unit, symbol = float(getattr(units, quantity)), in_fractions(SYMBOLS[quantity])
-        _scale(ax, 1, unit, f"{name} ({symbol})", before)
+        symbol, size = SI_UNITS[quantity]
+        _scale(ax, 1, float(size(units)), f"{name} ({in_fractions(symbol)})", before)
 
 
 def _put_velocity_aside(ax: Axes, unit: float, label: str, before: _Before | None) -> None:
