@@ -10,14 +10,14 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     results         status codes and advice
     activity        progress of functions that take long
     identity        fingerprints of values and functions
-    dimensions      dimensions of what results hold
     numerics/       spacing widths programs compiling
     checks          arguments, checked at the public edge
+    dimensions      dimensions of fields and results
     tables          results as tables
     numerics/       padding derivatives extrapolation newton continuation roots
     numerics/       control_points
-    model/          friction forcing oscillator own_units machine parameters si_units variations
-    model/          modes pseudofocus transitions instants rest events equilibria far_out
+    model/          friction forcing oscillator own_units machine parameters variations modes
+    model/          pseudofocus transitions instants rest events equilibria far_out
     presets         the published systems
     kernel/         lanes marks step events rounds waves clocked
     motion/         integrators arcs flights sensitivities sampling loops batches timed runs

@@ -27,11 +27,10 @@ from .cycles.shocks import FatalShock
 from .inverse.fit import Fit
 from .model.equilibria import Equilibria
 from .model.instants import field_at
-from .model.machine import Machine, Units
+from .model.machine import SI_UNITS, Machine, Units
 from .model.modes import STUCK, mode_of
 from .model.oscillator import Oscillator, at_time, constant_force, wave_at
-from .model.parameters import names_of
-from .model.si_units import SI_UNITS, unit_of
+from .model.parameters import names_of, unit_of
 from .motion.simulate import Trajectory
 from .results import EventKind, Status
 from .sweeps.basins import Basins, BasinStability

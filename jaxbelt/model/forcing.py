@@ -13,7 +13,7 @@ clock, and all of this package takes it.
 """
 
 import abc
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
@@ -31,13 +31,13 @@ from ..checks import (
     number,
     require_one_float,
     require_value,
+    scalar,
     traceable,
 )
 from ..dimensions import quantity
 
-
-def _number_named(name: str) -> Callable[[Any], Array]:
-    return lambda value: as_array(value, name)
+#: Dimensions of the fields of waves.
+FORCE, FREQUENCY, ANGLE = map(quantity, ("force", "frequency", "angle"))
 
 
 class _Wave(eqx.Module):
@@ -149,9 +149,7 @@ class ForceInUnits(AbstractForce):
 class ConstantForce(AbstractForce):
     """A constant force, as of an incline: a `Harmonic` with the frequency 0. No clock."""
 
-    amplitude: Float[Array, ""] = eqx.field(
-        converter=_number_named("amplitude"), metadata=quantity("force")
-    )
+    amplitude: Float[Array, ""] = eqx.field(converter=scalar("amplitude"), metadata=FORCE)
 
     def __init__(self, amplitude: ArrayLike):
         self.amplitude = amplitude  # pyright: ignore[reportAttributeAccessIssue]
@@ -177,15 +175,9 @@ class ConstantForce(AbstractForce):
 class _Sinusoid(AbstractForce):
     """A force of one wave, by its amplitude, frequency and phase."""
 
-    amplitude: Float[Array, ""] = eqx.field(
-        converter=_number_named("amplitude"), metadata=quantity("force")
-    )
-    frequency: Float[Array, ""] = eqx.field(
-        converter=_number_named("frequency"), metadata=quantity("frequency")
-    )
-    phase: Float[Array, ""] = eqx.field(
-        converter=_number_named("phase"), default=0.0, metadata=quantity("angle")
-    )
+    amplitude: Float[Array, ""] = eqx.field(converter=scalar("amplitude"), metadata=FORCE)
+    frequency: Float[Array, ""] = eqx.field(converter=scalar("frequency"), metadata=FREQUENCY)
+    phase: Float[Array, ""] = eqx.field(converter=scalar("phase"), default=0.0, metadata=ANGLE)
 
     def __check_init__(self):
         self.check(type(self).__name__)
@@ -237,7 +229,7 @@ class BaseMotion(_Sinusoid):
     """
 
     amplitude: Float[Array, ""] = eqx.field(
-        converter=_number_named("amplitude"), metadata=quantity("length")
+        converter=scalar("amplitude"), metadata=quantity("length")
     )
 
     def bound(self, damping: ArrayLike) -> Array:
@@ -270,14 +262,10 @@ class Oscillating(_Wave):
     """
 
     # Mean and amplitude have the dimension of what oscillates.
-    mean: Float[Array, ""] = eqx.field(converter=_number_named("mean"))
-    amplitude: Float[Array, ""] = eqx.field(converter=_number_named("amplitude"))
-    frequency: Float[Array, ""] = eqx.field(
-        converter=_number_named("frequency"), metadata=quantity("frequency")
-    )
-    phase: Float[Array, ""] = eqx.field(
-        converter=_number_named("phase"), default=0.0, metadata=quantity("angle")
-    )
+    mean: Float[Array, ""] = eqx.field(converter=scalar("mean"))
+    amplitude: Float[Array, ""] = eqx.field(converter=scalar("amplitude"))
+    frequency: Float[Array, ""] = eqx.field(converter=scalar("frequency"), metadata=FREQUENCY)
+    phase: Float[Array, ""] = eqx.field(converter=scalar("phase"), default=0.0, metadata=ANGLE)
 
     def __check_init__(self):
         self.check("Oscillating")

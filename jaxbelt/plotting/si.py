@@ -20,8 +20,7 @@ from ..bifurcations.base import BifurcationPoint
 from ..bifurcations.diagrams import BifurcationDiagram
 from ..checks import require
 from ..cycles.functionals import MEASURED_IN
-from ..model.machine import Units
-from ..model.si_units import SI_UNITS
+from ..model.machine import SI_UNITS, Units
 from ..si import AlongParameter, check_machine, units_along, units_of
 from ..sweeps.naming import rest_in_m
 from .draw import draw_result
