@@ -40,7 +40,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     api             the public names
     __init__        the public names, imported when the first one is used
     commands/       belts files options tables reproduce simulate diagram orbits map
-    commands/       sweep basins verify warm cache
+    commands/       sweep basins verify cache warm
     cli             the command line
 """
 

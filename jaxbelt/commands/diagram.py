@@ -1,7 +1,5 @@
 """`jaxbelt diagram`: equilibria, cycles and bifurcation points along a parameter."""
 
-import operator
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,10 +16,12 @@ from .options import (
     Vary,
     VarySpan,
     as_json_value,
+    check_least,
     check_range,
+    check_word,
     describes,
-    make_console,
     outputs,
+    picture,
     plain_errors,
     say,
     turn_on_float64,
@@ -91,12 +91,10 @@ def diagram(
 
     - jaxbelt diagram --file machine.toml --vary "belts[0].velocity" --span 0.05 0.3
     """
-    console = make_console()
     with plain_errors():
-        if rows < 1:
-            raise ValueError(f"rows must be at least 1, got {rows}")
-        if quantity is not None and quantity not in DRAWABLE:
-            raise ValueError(f"quantity must be one of {', '.join(DRAWABLE)}, got {quantity}")
+        check_least("rows", rows, 1)
+        if quantity is not None:
+            check_word("quantity", quantity, DRAWABLE)
         check_range("span", span)
         written = outputs(out, ".png", ".csv", "_points.csv")
         described.check(**({parameter: span[0]} if parameter in EDGES else {}))
@@ -108,17 +106,14 @@ def diagram(
         if parameter in EDGES:
             found = replace(found, name=parameter)
         from ..plotting.diagrams import plot_diagram
-        from ..plotting.style import draw_key, journal_figure, journal_style, save
+        from ..plotting.style import draw_key
 
-        with journal_style():
-            figure = journal_figure(7.2, 4.2)
+        with picture(written[0], 7.2, 4.2) as figure:
             if described.machine:
                 jb.plot_in_si(found, described.machine, figure.subplots(), quantity=quantity)
             else:
                 plot_diagram(found, figure.subplots(), quantity=quantity)
                 draw_key(figure)
-            out.parent.mkdir(parents=True, exist_ok=True)
-            save(figure, written[0])
         unit = described.unit(parameter)
         write_columns(branches_of(found, described.machine), written[1])
         points = points_of(found.points, *unit)
@@ -135,7 +130,7 @@ def diagram(
         lines += [
             ", ".join(f"{k} {v}" for k, v in row.items() if v != "") for row in rows_of_points
         ]
-    say(console, lines, written, as_json=as_json, data=data)
+    say(lines, written, as_json=as_json, data=data)
 
 
 def points_of(points: "tuple[jb.BifurcationPoint, ...]", unit: str, size: float) -> dict[str, Any]:
@@ -166,23 +161,12 @@ def branches_of(found: "jb.BifurcationDiagram", machine: "jb.Machine | None") ->
 
     With a machine they are in SI units.
     """
-    belts, branches = range(len(found.oscillator.belts)), found.branches
+    sticks = (f"stick_duration_{i}" for i in range(len(found.oscillator.belts)))
+    names = ["branch", "kind", "value", *FIELDS, *sticks]
     if machine:
         rows = jb.in_si(found, machine)
-        names = ["branch", "kind", "value", *FIELDS, *(f"stick_duration_{i}" for i in belts)]
         columns = in_columns(rows.isel(row=rows.branch.values >= 0), names)
-        return {name.replace("duration_", "duration"): one for name, one in columns.items()}
-
-    def joined(column: Callable[[Any], Any]) -> list[Any]:
-        return [entry for branch in branches for entry in column(branch).tolist()]
-
-    counted = [
-        (number, branch.kind) for number, branch in enumerate(branches) for _ in branch.values
-    ]
-    return {
-        "branch": [number for number, _ in counted],
-        "kind": [kind for _, kind in counted],
-        "value": joined(lambda branch: branch.values),
-        **{name: joined(operator.attrgetter(name)) for name in FIELDS},
-        **{f"stick_duration{i}": joined(lambda one, i=i: one.stick_durations[:, i]) for i in belts},
-    }
+    else:
+        table: Any = found.table().reindex(columns=names)
+        columns = dict(table[table.branch.notna()].items())
+    return {name.replace("duration_", "duration"): one for name, one in columns.items()}

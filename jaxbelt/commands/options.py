@@ -15,7 +15,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -23,6 +23,7 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 import jaxbelt as jb
 
@@ -126,6 +127,19 @@ def check_out(out: Path) -> None:
         raise OSError(f"out must be a place that can be written to, got {out}") from None
 
 
+def check_least(name: str, value: int, least: int) -> None:
+    """Raises unless an integer is as large as that, or larger."""
+    if value < least:
+        raise ValueError(f"{name} must be at least {least}, got {value}")
+
+
+def check_word(name: str, word: str, known: Collection[str]) -> None:
+    """Raises unless a word is one of those that are known; suggests one."""
+    if word not in known:
+        meant = did_you_mean(word, known)
+        raise ValueError(f"{name} must be one of {', '.join(known)}, got {word}{meant}")
+
+
 def check_number(name: str, value: float) -> None:
     """Raises unless a number is finite and > 0, like the package itself, but before it is
     imported."""
@@ -163,21 +177,35 @@ def make_console() -> Console:
     return console if console.is_terminal else Console(width=200)
 
 
+def steps_bar(console: Console, width: int, hidden: bool) -> Progress:
+    """A bar of steps with their names, of a width in letters."""
+    name = TextColumn(f"{{task.description:<{width}}}")
+    columns = name, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    return Progress(*columns, console=console, disable=hidden)
+
+
 def say(
-    console: Console,
-    lines: Iterable[str],
-    written: Iterable[Path],
-    *,
-    as_json: bool = False,
-    data: dict[str, Any] | None = None,
+    lines: Iterable[str], written: Iterable[Path] = (), *, as_json: bool, data: dict[str, Any]
 ) -> None:
     """Prints lines and the files that were written; or `data`, with these, as JSON."""
     if as_json:
-        print(json.dumps({**(data or {}), "written": [str(path) for path in written]}))
+        print(json.dumps({**data, "written": [str(path) for path in written]}))
         return
-    files = ", ".join(map(str, written))
+    console, files = make_console(), ", ".join(map(str, written))
     for line in (*lines, *([f"Written: {files}"] if files else [])):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def picture(path: Path, width: float, height: float) -> Iterator[Any]:
+    """An empty figure in the style of a journal, size in inches; it is written once drawn."""
+    from ..plotting.style import journal_figure, journal_style, save
+
+    with journal_style():
+        figure = journal_figure(width, height)
+        yield figure
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save(figure, path)
 
 
 def as_json_value(value: Any) -> Any:
@@ -263,6 +291,15 @@ Out = Annotated[
 def from_to(text: str) -> Any:
     """Option of an interval, FROM TO, with this help."""
     return typer.Option(metavar="FROM TO", help=text)
+
+
+def tolerance_of(default: str) -> Any:
+    """Option of the tolerance of a step; default: of the relative one."""
+    return typer.Option(
+        help="Relative and absolute tolerance of the integrator; of a machine the latter is in "
+        "max N / k.",
+        show_default=f"{default}, the absolute one of the oscillator's own size",
+    )
 
 
 Vary = Annotated[
@@ -365,7 +402,8 @@ class Description:
             for text in self.belt:
                 parts_of_belt(text)
             return
-        check_class(self.system)
+        if self.system not in CLASSES:
+            raise ValueError(f"class must be a, b, c or d, got {self.system}")
         for name in given:
             if name not in self.short_names:
                 known = ", ".join(self.short_names)
@@ -537,12 +575,6 @@ def _parameters(
 
 def _given(arguments: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in arguments.items() if value is not None}
-
-
-def check_class(system: str) -> None:
-    """Raises unless it is one of the paper's classes."""
-    if system not in CLASSES:
-        raise ValueError(f"class must be a, b, c or d, got {system}")
 
 
 def names_in_words(names: Iterable[str], paths: dict[str, str]) -> str:
