@@ -23,16 +23,17 @@ from ..cycles.functionals import MEASURED_IN
 from ..model.machine import SI_UNITS, Units
 from ..si import AlongParameter, check_machine, units_along, units_of
 from ..sweeps.naming import rest_in_m
+from .diagrams import QUANTITIES
 from .draw import draw_result
-from .style import figure_of, in_fractions, parameter_label, require_axes
+from .style import TIME, figure_of, in_fractions, parameter_label, require_axes
 
 #: For each label of an axis: its quantity, and its label in SI units.
 LABELS = {
-    r"time $\tau$": ("time", "time $t$ (s)"),
-    "period $T$": ("time", "period (s)"),
-    "displacement $x_1$": ("length", "displacement $X$ (m)"),
-    "amplitude of $x_1$": ("length", "amplitude of $X$ (m)"),
-    "velocity $x_2$": ("velocity", r"velocity $\dot X$ (m/s)"),
+    TIME: ("time", "time $t$ (s)"),
+    QUANTITIES["period"]: ("time", "period (s)"),
+    QUANTITIES["x1"]: ("length", "displacement $X$ (m)"),
+    QUANTITIES["amplitude"]: ("length", "amplitude of $X$ (m)"),
+    QUANTITIES["x2"]: ("velocity", r"velocity $\dot X$ (m/s)"),
     r"relative velocity $\nu_{\mathrm{R}}$": ("velocity", r"relative velocity $R$ (m/s)"),
 }
 #: Labels in SI units of parameters of an oscillator, by the end of their path.
