@@ -20,6 +20,7 @@ from .options import (
     check_range,
     check_word,
     describes,
+    option,
     outputs,
     picture,
     plain_errors,
@@ -53,9 +54,9 @@ def diagram(
     rows: Annotated[int, typer.Option(help="About how many values are computed.")] = 160,
     quantity: Annotated[
         str | None,
-        typer.Option(
-            help="What is drawn: amplitude, x1, x2 or period.",
-            show_default="amplitude where a cycle sticks, else x2, or x1 where there is no cycle",
+        option(
+            "What is drawn: amplitude, x1, x2 or period.",
+            "amplitude where a cycle sticks, else x2, or x1 where there is no cycle",
         ),
     ] = None,
     out: Out = Path("diagram"),

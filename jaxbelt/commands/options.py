@@ -227,8 +227,13 @@ def _of_classes(name: str) -> str:
     return "; ".join(f"{value} in {', '.join(names)}" for value, names in values.items())
 
 
+def option(text: str, default: str) -> Any:
+    """Option with this help, and words for its default."""
+    return typer.Option(help=text, show_default=default)
+
+
 def _argument(name: str, text: str) -> Any:
-    return typer.Option(help=text, show_default=_of_classes(name))
+    return option(text, _of_classes(name))
 
 
 Class = Annotated[str, typer.Option("--class", help="The paper's class of contact: a, b, c or d.")]
@@ -257,10 +262,10 @@ Forces = Annotated[
 ]
 File = Annotated[
     Path | None,
-    typer.Option(
-        help="A TOML file that describes the oscillator, or a machine in SI units, instead of all "
-        "these options: see **jaxbelt simulate --help**.",
-        show_default="none",
+    option(
+        "A TOML file that describes the oscillator, or a machine in SI units, instead of all these "
+        "options: see **jaxbelt simulate --help**.",
+        "none",
     ),
 ]
 Damping = Annotated[float, typer.Option(help="zeta = c / sqrt(k m).")]
@@ -295,11 +300,8 @@ def from_to(text: str) -> Any:
 
 def tolerance_of(default: str) -> Any:
     """Option of the tolerance of a step; default: of the relative one."""
-    return typer.Option(
-        help="Relative and absolute tolerance of the integrator; of a machine the latter is in "
-        "max N / k.",
-        show_default=f"{default}, the absolute one of the oscillator's own size",
-    )
+    text = "Relative and absolute tolerance of the integrator; of a machine the latter is in "
+    return option(f"{text}max N / k.", f"{default}, the absolute one of the oscillator's own size")
 
 
 Vary = Annotated[

@@ -17,6 +17,7 @@ from .options import (
     check_number,
     check_word,
     describes,
+    option,
     outputs,
     plain_errors,
     say,
@@ -33,10 +34,7 @@ def simulate(
     start: Start = None,
     t1: Annotated[
         float | None,
-        typer.Option(
-            help="End of the time span, which begins at 0; of a machine in s.",
-            show_default="100, dimensionless",
-        ),
+        option("End of the time span, which begins at 0; of a machine in s.", "100, dimensionless"),
     ] = None,
     samples: Annotated[
         int, typer.Option(help="How many times, evenly spread over the span, are written.")
@@ -49,17 +47,10 @@ def simulate(
     ] = "filippov",
     v_star: Annotated[
         float | None,
-        typer.Option(
-            help="Half-width of the switch model's band, a velocity.",
-            show_default="0.001, dimensionless",
-        ),
+        option("Half-width of the switch model's band, a velocity.", "0.001, dimensionless"),
     ] = None,
     eps: Annotated[
-        float | None,
-        typer.Option(
-            help="Width of the smooth model's tanh, likewise.",
-            show_default="0.001, dimensionless",
-        ),
+        float | None, option("Width of the smooth model's tanh, likewise.", "0.001, dimensionless")
     ] = None,
     tolerance: Annotated[float | None, tolerance_of("1e-10")] = None,
     out: Out = Path("trajectory"),

@@ -18,6 +18,7 @@ from .options import (
     check_out,
     check_word,
     describes,
+    option,
     picture,
     plain_errors,
     say,
@@ -71,17 +72,16 @@ def sweep(
     ] = "attractor",
     variable: Annotated[
         str | None,
-        typer.Option(
-            help="What the picture shows, a variable of the dataset.",
-            show_default="kind, of the final state x1_end",
+        option(
+            "What the picture shows, a variable of the dataset.", "kind, of the final state x1_end"
         ),
     ] = None,
     start: Start = None,
     t1: Annotated[
         float | None,
-        typer.Option(
-            help="End of each run; of a machine in s.",
-            show_default="30000 for attractors, 100 for the final state, 1000 for exponents",
+        option(
+            "End of each run; of a machine in s.",
+            "30000 for attractors, 100 for the final state, 1000 for exponents",
         ),
     ] = None,
     tolerance: Annotated[float | None, tolerance_of("1e-8")] = None,
