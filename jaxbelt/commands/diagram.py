@@ -29,8 +29,6 @@ from .options import (
 )
 from .tables import headed, in_columns, write_columns
 
-#: Arguments of classes that may be varied besides velocities: an edge of two belts, or of one.
-EDGES = ("sigma", "sigma0", "sigma1")
 #: Quantities that a diagram can show.
 DRAWABLE = ("amplitude", "x1", "x2", "period")
 #: Fields of a branch that are columns of the table.
@@ -98,13 +96,12 @@ def diagram(
             check_word("quantity", quantity, DRAWABLE)
         check_range("span", span)
         written = outputs(out, ".png", ".csv", "_points.csv")
-        described.check(**({parameter: span[0]} if parameter in EDGES else {}))
         described.check_parameter(parameter)
         turn_on_float64()
         given = None if start is None else described.start(start)
         path = described.path_along(parameter, span)
         found = jb.bifurcation_diagram(*path, start=given, rows=rows)
-        if parameter in EDGES:
+        if path[1] is None:
             found = replace(found, name=parameter)
         from ..plotting.diagrams import plot_diagram
         from ..plotting.style import draw_key

@@ -38,6 +38,8 @@ CLASSES = {
     "c": {"nu0": 0.2, "nu1": 0.4, "sigma": 0.8},
     "d": {"nu0": 0.2, "nu1": 0.4, "sigma0": 0.5, "sigma1": 1.0},
 }
+#: Arguments of classes that are edges: of two belts, or of one.
+EDGES = ("sigma", "sigma0", "sigma1")
 
 
 @contextmanager
@@ -381,23 +383,23 @@ class Description:
     @property
     def arguments(self) -> dict[str, float | None]:
         """Arguments of the class, None where one is not given."""
-        return {name: getattr(self, name) for name in ("nu0", "nu1", "sigma", "sigma0", "sigma1")}
+        return {name: getattr(self, name) for name in ("nu0", "nu1", *EDGES)}
 
     @property
     def short_names(self) -> tuple[str, ...]:
         """Names of the arguments of the class; none for belts in full."""
         return () if self.belt or self.file else tuple(CLASSES[self.system])
 
-    def check(self, **varied: float) -> None:
+    def check(self, *varied: str) -> None:
         """Raises unless the options describe belts; the classes themselves check numbers.
 
-        varied: values of arguments of the class that vary.
+        varied: parameters that vary. An edge of class (c) or (d) among them is an argument, too.
         """
         if self.source:
             return
         for text in self.force or ():
             parts_of_force(text)
-        given = _given(self.arguments | varied)
+        given = _given(self.arguments) | dict.fromkeys(name for name in varied if name in EDGES)
         if self.belt:
             if given:
                 raise ValueError(f"with --belt no class must be described, got {', '.join(given)}")
@@ -412,7 +414,8 @@ class Description:
                 raise ValueError(f"class {self.system} must have only {known}, got {name}")
 
     def check_parameter(self, name: str) -> None:
-        """Raises unless a parameter along which something is computed is known."""
+        """Raises unless belts are described, and the parameter that is to vary is known."""
+        self.check(name)
         paths, short = self.parameters(), self.short_names
         if name not in (*short, *paths):
             known, meant = names_in_words(short, paths), did_you_mean(name, (*short, *paths))

@@ -78,7 +78,6 @@ def orbits(
         check_range("span", span)
         further = list(map(parse_start, also or ()))
         written = outputs(out, ".png", ".csv")
-        described.check(**({parameter: span[0]} if parameter in described.short_names else {}))
         described.check_parameter(parameter)
         turn_on_float64()
         y0 = [described.start(one) for one in (start, *further)]

@@ -199,11 +199,8 @@ def quantities_of(dataset: "xarray.Dataset") -> dict[str, str]:
 
     In stores of earlier versions none has it; there the observers describe the variables.
     """
-    stated = {
-        str(name): variable.attrs["quantity"]
-        for name, variable in dataset.variables.items()
-        if "quantity" in variable.attrs
-    }
+    named = dataset.variables.items()
+    stated = {str(name): one.attrs["quantity"] for name, one in named if "quantity" in one.attrs}
     if stated or dataset.attrs.get("observe", "final") not in NAMED_FORCED:
         return stated
     observers = (*NAMED.values(), *NAMED_FORCED.values())
