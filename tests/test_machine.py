@@ -426,6 +426,15 @@ def test_results_of_ones_own_state_their_dimensions_where_they_are_to_be_convert
         jb.in_si(own, machine)
 
 
+def test_attractors_of_a_sweep_take_the_function_of_the_sweep():
+    """The numbers of the attractors are no argument of it."""
+    axes = {"V": ("V", [0.01, 0.02]), "attractor": ("attractor", [0, 1])}
+    x1_max = (("V", "attractor"), np.array([[1.0, 2.0], [3.0, 4.0]]), {"quantity": "length"})
+    shares = xr.Dataset({"x1_max": x1_max}, axes, {"observe": "attractor"})
+    ours = jb.in_si(shares, machine)
+    assert ours.x1_max.units == "m" and np.allclose(ours.x1_max, shares.x1_max * 5.0 / STIFFNESS)
+
+
 @pytest.mark.slow(first=True)
 def test_units_may_differ_from_run_to_run():
     axes = {"N": np.array([5.0, 1.0, 10.0])}
