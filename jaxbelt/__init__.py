@@ -12,6 +12,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     identity        fingerprints of values and functions
     numerics/       spacing widths programs compiling
     checks          arguments, checked at the public edge
+    dimensions      dimensions of fields and results
     tables          results as tables
     numerics/       padding derivatives implicit extrapolation newton continuation
     numerics/       roots polynomials control_points
@@ -41,7 +42,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     api             the public names
     __init__        the public names, imported when the first one is used
     commands/       belts files options tables reproduce simulate diagram orbits map
-    commands/       sweep basins verify warm cache
+    commands/       sweep basins verify cache warm
     cli             the command line
 """
 

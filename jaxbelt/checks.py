@@ -287,6 +287,11 @@ def as_array(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Arra
         return jnp.asarray(numbers, dtype=jnp.float64)
 
 
+def scalar(field: str) -> Callable[[Any], Array]:
+    """Converter of a field that is a number, see `as_array`."""
+    return lambda value: as_array(value, field)
+
+
 def as_positive_number(value: Any, field: str) -> Array | np.ndarray:
     """`value` as a number, > 0 as far as it is known, see `as_numbers`."""
     number = as_numbers(value, field)

@@ -1,16 +1,14 @@
 """Results in SI units: `in_si`.
 
-The name of a variable determines its dimension. Variables with other names, such as results of a
-user's observable, stay as they are.
+Variables of datasets and columns of tables state their dimensions, see `dimensions`; what states
+none, such as the results of a user's observable, stays as it is.
 """
 
 import functools
 import inspect
-import re
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Union
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +18,7 @@ from .activity import announced
 from .bifurcations.base import BifurcationPoint
 from .bifurcations.curves import BifurcationCurve
 from .bifurcations.diagrams import BifurcationDiagram
-from .checks import in_words, outside_of_traces, require
+from .checks import in_words, outside_of_traces, require, require_one_of
 from .cycles.cycle import Cycle
 from .cycles.functionals import energy_dissipated
 from .cycles.periodic import PeriodicMotion
@@ -28,64 +26,29 @@ from .cycles.portrait import Portrait
 from .cycles.shocks import FatalShock
 from .inverse.fit import Fit
 from .model.equilibria import Equilibria
-from .model.forcing import BaseMotion, ConstantForce, Harmonic
-from .model.friction import LawInUnits
-from .model.machine import Machine, Units
-from .model.modes import STUCK, mode_acceleration, mode_of, stick_rate
+from .model.instants import field_at
+from .model.machine import SI_UNITS, Machine, Units
+from .model.modes import STUCK, mode_of
 from .model.oscillator import Oscillator, at_time, constant_force, wave_at
-from .model.parameters import names_of
+from .model.parameters import names_of, unit_of
 from .motion.simulate import Trajectory
 from .results import EventKind, Status
 from .sweeps.basins import Basins, BasinStability
 from .sweeps.datasets import flags
 from .sweeps.fractions import BasinFractions
+from .sweeps.naming import rest_in_m
 from .sweeps.orbit_diagram import OrbitDiagram
+from .sweeps.question import quantities_of
 
 if TYPE_CHECKING:
     import pandas
     import xarray
 
-#: Dimensions of the variables of this package, by name.
-DIMENSIONS = {
-    **dict.fromkeys(("t", "t_event", "period", "transient", "stick_duration"), "time"),
-    **dict.fromkeys(("x1", "x1_event", "x1_end", "x1_min", "x1_max", "amplitude"), "length"),
-    **dict.fromkeys(("x2", "x2_event", "x2_end", "x2_min", "x2_max"), "velocity"),
-    **{"x1_residual": "length", "x2_residual": "velocity"},
-    **{"shock_x1": "length", "shock_x2": "velocity"},
-    **{"x1_strobe": "length", "x2_strobe": "velocity"},
-    **dict.fromkeys(("exponent", "exponent_error"), "rate"),
-    "force": "force",
-    "energy": "energy",
-}
-#: Units of the numbers of oscillators, by field: the unit, and the value of 1 in it.
-UNITS_OF_FIELDS: dict[str, tuple[str, Callable[[Units], Any]]] = {
-    "damping": ("N s m-1", lambda units: units.force / units.velocity),
-    "velocity": ("m s-1", lambda units: units.velocity),
-    "load": ("N", lambda units: units.force),
-    **dict.fromkeys(("lower", "upper"), ("m", lambda units: units.length)),
-    "frequency": ("rad s-1", lambda units: 1 / units.time),
-    "phase": ("rad", lambda units: jnp.ones(())),
-}
-#: Likewise of the amplitude of a force; numbers of a user's force have units that its author knows.
-UNITS_OF_FORCES = {
-    **dict.fromkeys((Harmonic, ConstantForce), ("N", lambda units: units.force)),
-    BaseMotion: ("m", lambda units: units.length),
-}
-#: Relative accuracy to which a number of a friction law has to follow a power of the unit of speed.
-POWER_ROUNDING = 1e-12
 #: Relative difference up to which numbers of a machine's oscillator and of a result's count as
 #: equal: they may have been computed in different ways.
 SAME_MACHINE = 1e-9
 #: Results along a parameter.
 AlongParameter = BifurcationDiagram | OrbitDiagram | BasinFractions
-SYMBOLS = {
-    **{"time": "s", "length": "m", "velocity": "m s-1", "force": "N", "energy": "J"},
-    "rate": "s-1",
-}
-
-
-#: Where the mass rests, at the end of the words for an attractor of `basins`.
-REST = re.compile(r"(?<=rest.at.)-?\d+(\.\d+)?(e[+-]\d+)?$")
 #: Advice for results that `in_si` does not take.
 INSTEAD = {
     BifurcationPoint: "; its value is in the unit of the argument where a function was given in "
@@ -143,8 +106,9 @@ def in_si(
       frequency of a force, in N for its amplitude (in m for that of a support); the argument of a
       function stays as the function takes it.
     - a dataset: its own variables, with derivatives by starts and parameters where the units are
-      the same in all runs. Results of a user's observable stay dimensionless, and so does the
-      attribute `start`; the words for `label` of basins say in m where the mass rests.
+      the same in all runs. Results of a user's observable stay dimensionless unless they state
+      their dimension, `dataset.largest.attrs["quantity"] = "length"`, and so does the attribute
+      `start`; the words for `label` of basins say in m where the mass rests.
 
     Where a function was given in place of an oscillator, the value of a `BifurcationPoint` and
     those of a `BifurcationCurve` are in the units of its arguments already; the cycle at a point is
@@ -173,28 +137,27 @@ def in_si(
     """
     import xarray
 
-    one: Any = machine  # its type is checked where it is used
     match result:
         case Trajectory():
-            return _trajectory(result, one)
+            return _trajectory(result, machine)
         case Cycle() | PeriodicMotion():
-            return _cycle(result, one)
+            return _cycle(result, machine)
         case Portrait():
-            return _of_portrait(result, one)
+            return _of_portrait(result, machine)
         case FatalShock():
-            return _of_shock(result, one)
+            return _of_shock(result, machine)
         case Basins():
             check_machine(result, machine)
             return _dataset(result.dataset, machine)
         case BasinStability():
             return _rows_in_units(result.table(), units_of(machine))
         case Fit():
-            return _fitted(result, one)
+            return _fitted(result, machine)
         case BifurcationDiagram() | OrbitDiagram() | BasinFractions():
             return _along(result, machine)
         case xarray.Dataset():
             present = {variable.attrs.get("units") for variable in result.variables.values()}
-            is_done = bool(present & set(SYMBOLS.values()))
+            is_done = bool(present & {symbol for symbol, _ in SI_UNITS.values()})
             require(not is_done, "result", "dimensionless", "a dataset that is in SI units")
             return _dataset(result, machine)
     raise TypeError(
@@ -215,16 +178,6 @@ def units_of(machine: Any) -> Units:
     raise ValueError(f"machine must be a Machine, got {in_words(machine)}{hint}")
 
 
-def rest_in_m(words: str, units: Units) -> str:
-    """The words for an attractor with the place of rest in m, to the digits that are known."""
-
-    def in_m(found: re.Match) -> str:
-        digits = len(found[0].partition("e")[0].replace(".", "").lstrip("-0"))
-        return f"{float(found[0]) * float(units.length):.{max(1, digits)}g} m"
-
-    return REST.sub(in_m, words)
-
-
 def check_machine(result: Any, machine: Any) -> None:
     """Raises a `ValueError` if a result keeps its oscillator and that of the machine is another
     one.
@@ -236,11 +189,11 @@ def check_machine(result: Any, machine: Any) -> None:
     free: set[str] = set()
     match result:
         case BifurcationDiagram() | OrbitDiagram() | BasinFractions():
-            osc, free = _at_first_value(result), {result.name}
+            (first, osc), free = _at_first_value(result), {result.name}
             if osc is None:
                 return
             if result.is_argument:
-                machine = machine(**{result.name: _first_value(result)})
+                machine = machine(**{result.name: first})
         case Fit():
             osc = result.oscillator
             free = {name for tied in result.names for name in tied.split(" = ")}
@@ -258,8 +211,8 @@ def check_machine(result: Any, machine: Any) -> None:
     own, belts = machine.oscillator, len(osc.belts)
     require(len(own.belts) == belts, "machine", f"of {belts} belts", f"{len(own.belts)} belts")
     one, other = _numbers_of(own), _numbers_of(osc)
-    for name in one.keys() | other.keys():
-        require(name in one and name in other, "machine", "with the laws of the result", machine)
+    fits = one.keys() == other.keys()
+    require(fits, "machine", "with the laws of the result", machine)
     for name, value in other.items():
         fits = name in free or np.allclose(one[name], value, rtol=SAME_MACHINE, atol=0)
         expected = f"the one of the result, whose oscillator has {name} = {value:.12g}"
@@ -267,18 +220,14 @@ def check_machine(result: Any, machine: Any) -> None:
         require(fits, "machine", expected, came)
 
 
-def _first_value(result: BifurcationDiagram | OrbitDiagram | BasinFractions) -> float:
-    is_diagram = isinstance(result, BifurcationDiagram)
-    return float(result.regions[0][0] if is_diagram else result.values[0])
-
-
-def _at_first_value(result: AlongParameter) -> Oscillator | None:
-    """The oscillator of a result at the first value of its parameter, where it keeps one."""
+def _at_first_value(result: AlongParameter) -> tuple[float, Oscillator | None]:
+    """The first value of the parameter of a result, and the oscillator there, if it keeps one."""
     if isinstance(result, BifurcationDiagram):
-        return result.oscillator
+        return float(result.regions[0][0]), result.oscillator
+    first, osc = float(result.values[0]), None
     if isinstance(result, OrbitDiagram) and result.sampling is not None:
-        return result.sampling.variation.oscillator(np.array([_first_value(result)]))
-    return None
+        osc = result.sampling.variation.oscillator(np.array([first]))
+    return first, osc
 
 
 def _numbers_of(osc: Oscillator) -> dict[str, float]:
@@ -286,10 +235,10 @@ def _numbers_of(osc: Oscillator) -> dict[str, float]:
     return {name: float(leaf) for name, leaf in pairs if np.ndim(leaf) == 0}
 
 
-def _variable(dims: Any, values: Any, name: str, units: Units, long_name: str) -> tuple:
-    quantity = DIMENSIONS[name]
-    scaled = np.asarray(values) * np.asarray(getattr(units, quantity))
-    return dims, scaled, {"long_name": long_name, "units": SYMBOLS[quantity]}
+def _variable(units: Units, dims: Any, values: Any, dimension: str, long_name: str) -> tuple:
+    symbol, size = SI_UNITS[dimension]
+    scaled = np.asarray(values) * np.asarray(size(units))
+    return dims, scaled, {"long_name": long_name, "units": symbol}
 
 
 @jax.jit
@@ -301,32 +250,27 @@ def _friction_force(osc: Oscillator, codes: Array, ys: Array, ts: Array) -> Arra
     """
 
     def at(codes, y, t):
-        now, mode, (x1, x2) = at_time(osc, t), mode_of(codes), y
-        rate = stick_rate(now, mode) / osc.omega
-        a = jnp.where(mode.any_stuck, rate, mode_acceleration(now, mode, x1, x2))
-        return sum((-push for push in constant_force(now)), start=a + x1 + osc.damping * x2)
+        _, a, _ = field_at(osc, mode_of(codes), (*y, t))
+        pushes = constant_force(at_time(osc, t))
+        return sum((-push for push in pushes), start=a + y[0] + osc.damping * y[1])
 
     return jax.vmap(at)(codes.astype(jnp.float64), ys, ts)
 
 
-def _trajectory(run: Trajectory, machine: Machine | Units) -> "xarray.Dataset":
+def _trajectory(run: Trajectory, machine: Any) -> "xarray.Dataset":
     import xarray
 
     units, belts = units_of(machine), run.modes.shape[-1]
     require(run.ts.ndim == 1, "result", "one trajectory, not a batch", repr(run))
     check_machine(run, machine)
-
-    def variable(dims, values, name, long_name):
-        return _variable(dims, values, name, units, long_name)
-
-    events = run.events
+    events, variable = run.events, functools.partial(_variable, units)
     found = {
-        "x1": variable("t", run.ys[:, 0], "x1", "displacement"),
-        "x2": variable("t", run.ys[:, 1], "x2", "velocity"),
+        "x1": variable("t", run.ys[:, 0], "length", "displacement"),
+        "x2": variable("t", run.ys[:, 1], "velocity", "velocity"),
         "mode": (("t", "belt"), np.asarray(run.modes), {"long_name": "contact with the belt"}),
-        "t_event": variable("event", events.t, "t", "time of the event"),
-        "x1_event": variable("event", events.y[:, 0], "x1", "displacement at the event"),
-        "x2_event": variable("event", events.y[:, 1], "x2", "velocity at the event"),
+        "t_event": variable("event", events.t, "time", "time of the event"),
+        "x1_event": variable("event", events.y[:, 0], "length", "displacement at the event"),
+        "x2_event": variable("event", events.y[:, 1], "velocity", "velocity at the event"),
         "event_kind": (
             "event",
             np.asarray(events.kind, np.int8),
@@ -337,9 +281,8 @@ def _trajectory(run: Trajectory, machine: Machine | Units) -> "xarray.Dataset":
     if run.arcs.t.size and isinstance(machine, Machine):
         force = _friction_force(machine.oscillator, run.modes, run.ys, run.ts)
         found["force"] = variable("t", force, "force", "friction on the mass")
-    time = variable("t", run.ts, "t", "time")
-    attrs = {"status": Status(int(run.status)).name}
-    return xarray.Dataset(found, {"t": time, "belt": np.arange(belts)}, attrs)
+    coordinates = {"t": variable("t", run.ts, "time", "time"), "belt": np.arange(belts)}
+    return xarray.Dataset(found, coordinates, {"status": Status(int(run.status)).name})
 
 
 def _check_belts(run: Trajectory, machine: Any) -> None:
@@ -358,153 +301,82 @@ def _check_belts(run: Trajectory, machine: Any) -> None:
     for belt, held in enumerate(stuck.T):
         velocity = np.asarray(wave_at(osc.belts[belt].velocity, run.ts))
         own, its = np.broadcast_to(velocity, held.shape)[held], np.asarray(run.ys)[held, 1]
-        fits = np.allclose(its, own, rtol=SAME_MACHINE, atol=SAME_MACHINE)
-        if not fits:
+        if not np.allclose(its, own, rtol=SAME_MACHINE, atol=SAME_MACHINE):
             came = f"one that sticks to belt {belt} at {its[0]:.12g}"
             expected = f"of the machine, its belt {belt} at velocity {own[0]:.12g}"
             require(False, "result", expected, came)
 
 
-def _cycle(cycle: Cycle | PeriodicMotion, machine: Machine | Units) -> "xarray.Dataset":
+def _cycle(cycle: Cycle | PeriodicMotion, machine: Any) -> "xarray.Dataset":
     import xarray
 
     units = units_of(machine)
     require(cycle.unknowns.ndim == 2, "result", "one cycle, not a batch", repr(cycle))
     check_machine(cycle, machine)
-    x1_min, x1_max = cycle.x1_min, cycle.x1_max
-    variables = {
-        "period": ((), cycle.period, "period"),
-        "stick_duration": ("belt", cycle.stick_durations, "time stuck to the belt in one loop"),
-        "x1_min": ((), x1_min, "smallest displacement"),
-        "x1_max": ((), x1_max, "largest displacement"),
-        "x2_min": ((), cycle.x2_min, "smallest velocity"),
-        "x2_max": ((), cycle.x2_max, "largest velocity"),
-        "amplitude": ((), (x1_max - x1_min) / 2, "half of the span of displacement"),
+    x1_min, x1_max, sticks = cycle.x1_min, cycle.x1_max, cycle.stick_durations
+    variable, half = functools.partial(_variable, units), (x1_max - x1_min) / 2
+    found = {
+        "period": variable((), cycle.period, "time", "period"),
+        "stick_duration": variable("belt", sticks, "time", "time stuck to the belt in one loop"),
+        "x1_min": variable((), x1_min, "length", "smallest displacement"),
+        "x1_max": variable((), x1_max, "length", "largest displacement"),
+        "x2_min": variable((), cycle.x2_min, "velocity", "smallest velocity"),
+        "x2_max": variable((), cycle.x2_max, "velocity", "largest velocity"),
+        "amplitude": variable((), half, "length", "half of the span of displacement"),
     }
     attrs: dict[str, Any] = {"status": Status(int(cycle.status)).name}
     if isinstance(cycle, PeriodicMotion):
-        attrs["periods"] = cycle.periods
-        for i, word in enumerate(("displacement", "velocity")):
-            variables[f"x{i + 1}"] = ((), cycle.start[i], f"{word} at the phase 0")
+        attrs["periods"], (x1, x2) = cycle.periods, cycle.start
+        found["x1"] = variable((), x1, "length", "displacement at the phase 0")
+        found["x2"] = variable((), x2, "velocity", "velocity at the phase 0")
     else:
         energy = energy_dissipated(cycle)
-        variables["energy"] = ((), energy, "energy dissipated in one period")
-    found = {
-        name: _variable(dims, values, name, units, long_name)
-        for name, (dims, values, long_name) in variables.items()
-    }
+        found["energy"] = variable((), energy, "energy", "energy dissipated in one period")
     return xarray.Dataset(found, {"belt": np.arange(len(cycle.oscillator.belts))}, attrs)
 
 
-def _of_portrait(portrait: Portrait, machine: Machine | Units) -> "xarray.Dataset":
+def _of_portrait(portrait: Portrait, machine: Any) -> "xarray.Dataset":
     check_machine(portrait, machine)
-    units, table = units_of(machine), portrait.table()
-    rate = table["rate"].to_numpy(float) / float(units.time)
-    attributes = {"long_name": "rate at which small motions about it grow", "units": "s-1"}
-    found = _rows_in_units(table.drop(columns="rate"), units).assign(rate=("row", rate, attributes))
+    found = _rows_in_units(portrait.table(), units_of(machine))
+    found["rate"].attrs["long_name"] = "rate at which small motions about it grow"
     return found.assign_attrs(status=Status(int(portrait.status)).name)
 
 
-def _of_shock(shock: FatalShock, machine: Machine | Units) -> "xarray.Dataset":
+def _of_shock(shock: FatalShock, machine: Any) -> "xarray.Dataset":
     check_machine(shock, machine)
-    table, units = shock.table(), units_of(machine)
-    distance, attributes = float(shock.distance), {"long_name": "size of the shock"}
-    if shock.direction == "x2":
-        distance, attributes["units"] = distance * float(units.velocity), SYMBOLS["velocity"]
-    words = ("attractor", "direction", "boundary", "beyond", "status")
-    found = _rows_in_units(table.drop(columns=["distance", *words]), units).squeeze("row")
-    attrs = {name: table[name][0] for name in words}
-    return found.assign(distance=((), distance, attributes)).assign_attrs(attrs)
+    found = _rows_in_units(shock.table(), units_of(machine)).squeeze("row")
+    found["distance"].attrs["long_name"] = "size of the shock"
+    words = ["attractor", "direction", "boundary", "beyond", "status"]
+    return found.drop_vars(words).assign_attrs({name: found[name].item() for name in words})
 
 
-def _fitted(fit: Fit, machine: Machine | Units) -> "xarray.Dataset":
+def _fitted(fit: Fit, machine: Any) -> "xarray.Dataset":
     import xarray
 
     check_machine(fit, machine)
     units, table = units_of(machine), fit.table()
-    known = [
-        *(unit_of(name, fit.oscillator, units) for name in fit.names),
-        *_units_of_start(units),
-    ]
+    start = [SI_UNITS[dimension] for dimension in ("length", "velocity")]
+    known = [unit_of(name, fit.oscillator, units) for name in fit.names]
+    known += [(symbol, float(size(units))) for symbol, size in start]
     symbols, sizes = zip(*known, strict=True)
     columns = ("estimate", "standard_error", "lower", "upper")
     found: dict[str, Any] = {
         name: ("parameter", table[name].to_numpy() * np.array(sizes)) for name in columns
     }
-    motions = {"": fit.ys, "_residual": fit.residuals}
-    for i, word in enumerate(("displacement", "velocity")):
-        for end, values in motions.items():
-            name, words = f"x{i + 1}{end}", f"residual of the {word}" if end else f"fitted {word}"
-            found[name] = _variable("t", values[:, i], name, units, words)
-    time = _variable("t", fit.ts, "t", units, "time")
+    variable, ys, residuals = functools.partial(_variable, units), fit.ys, fit.residuals
+    found |= {
+        "x1": variable("t", ys[:, 0], "length", "fitted displacement"),
+        "x1_residual": variable("t", residuals[:, 0], "length", "residual of the displacement"),
+        "x2": variable("t", ys[:, 1], "velocity", "fitted velocity"),
+        "x2_residual": variable("t", residuals[:, 1], "velocity", "residual of the velocity"),
+    }
     coordinates = {
-        "parameter": table["name"].tolist(),
-        "unit": ("parameter", list(symbols)),
-        "t": time,
+        **{"parameter": table["name"].tolist(), "unit": ("parameter", list(symbols))},
+        "t": variable("t", fit.ts, "time", "time"),
     }
     chi2 = float(fit.reduced_chi_squared)
     attrs = {"status": Status(int(fit.status)).name, "reduced_chi_squared": chi2}
     return xarray.Dataset(found, coordinates, attrs)
-
-
-def unit_of(name: str, osc: Oscillator, units: Units) -> tuple[str, float]:
-    """Unit of a parameter of a fit, and the value of 1 in it; tied parameters must have the
-    same."""
-    found = set()
-    for path in name.split(" = "):
-        if ".friction." in path:
-            found.add(_unit_in_law(path, osc, units))
-        else:
-            symbol, size = _unit_of_field(path, osc)
-            found.add((symbol, float(size(units))))
-    require(len(found) == 1, "result", "of tied parameters with one unit", name)
-    return found.pop()
-
-
-def _unit_of_field(path: str, osc: Oscillator) -> tuple[str, Callable[[Units], Any]]:
-    """As `UNITS_OF_FIELDS`, for a number that is in no friction law."""
-    owner, _, field = path.rpartition(".")
-    if owner.startswith("forcing["):
-        force = osc.forcing[int(owner.removeprefix("forcing[").partition("]")[0])]
-        known = UNITS_OF_FORCES.get(type(force))
-        if known is None:
-            return "", lambda units: 1.0
-        return known if field == "amplitude" else UNITS_OF_FIELDS[field]
-    # The mean and the amplitude of a wave are what the field is that oscillates.
-    return UNITS_OF_FIELDS[owner.rpartition(".")[2] if field in ("mean", "amplitude") else field]
-
-
-def _unit_in_law(path: str, osc: Oscillator, units: Units) -> tuple[str, float]:
-    """Unit of a number of a friction law, and the value of 1 in it.
-
-    It follows from how the number changes when speeds are given in another unit; "" and 1 where the
-    law takes speeds in a unit that only its author knows.
-    """
-    number = names_of(osc).index(path)
-    leaves, structure = jax.tree.flatten(osc)
-    if not np.any(leaves[number]):
-        leaves[number] = jnp.ones(())
-        osc = jax.tree.unflatten(structure, leaves)
-    index = int(path.removeprefix("belts[").partition("]")[0])
-    law = osc.belts[index].friction
-    halved = law.in_units_of(jnp.asarray(2.0))
-    if isinstance(law, LawInUnits) or type(halved) is not type(law):
-        return "", 1.0
-    scaled = eqx.tree_at(lambda o: o.belts[index].friction, osc, halved)
-    ratio = float(jax.tree.leaves(scaled)[number] / leaves[number])
-    power = round(np.log2(ratio)) if ratio > 0 else 0
-    is_power = abs(ratio / 2.0**power - 1) < POWER_ROUNDING
-    require(is_power, "result", "of what goes with a power of the speed in in_units_of", path)
-    symbol = " ".join(
-        unit + (str(n) if n != 1 else "")
-        for n, unit in sorted(((power, "s"), (-power, "m")), reverse=True)
-        if n
-    )
-    return symbol or "1", float(units.velocity) ** -power
-
-
-def _units_of_start(units: Units) -> list[tuple[str, float]]:
-    return [(SYMBOLS[name], float(getattr(units, name))) for name in ("length", "velocity")]
 
 
 def _along(result: AlongParameter, machine: Any) -> "xarray.Dataset":
@@ -513,24 +385,22 @@ def _along(result: AlongParameter, machine: Any) -> "xarray.Dataset":
     units, (symbol, size) = units_along(result, values, machine)
     check_machine(result, machine)
     attributes = {"long_name": result.name, **({"units": symbol} if symbol else {})}
-    rest = _rows_in_units(table.drop(columns="value"), units)
-    return rest.assign(value=("row", values * size, attributes))
+    return _rows_in_units(table, units).assign(value=("row", values * size, attributes))
 
 
 def _rows_in_units(table: "pandas.DataFrame", units: Units) -> "xarray.Dataset":
-    """Columns of a table over `row`, converted where they have a unit."""
+    """Columns of a table over `row`, converted where they state a dimension."""
     import xarray
 
-    found: dict[str, Any] = {}
+    found, quantities = {}, table.attrs["quantities"]
     for name in map(str, table.columns):
-        quantity = "stick_duration" if name.startswith("stick_duration_") else name
-        if quantity in DIMENSIONS:
-            words = name.replace("_", " ")
-            found[name] = _variable("row", table[name].to_numpy(float), quantity, units, words)
+        if name in quantities:
+            column, words = table[name].to_numpy(float), name.replace("_", " ")
+            found[name] = _variable(units, "row", column, quantities[name], words)
         else:
-            missing = {"branch": -1, "stable": False, "neutral": False}.get(name)
+            missing = {"Int64": -1, "boolean": False}.get(str(table[name].dtype))
             column = table[name] if missing is None else table[name].fillna(missing)
-            plain = column.to_numpy({"branch": int, "stable": bool, "neutral": bool}.get(name))
+            plain = column.to_numpy(None if missing is None else type(missing))
             found[name] = ("row", plain.astype(str) if plain.dtype == object else plain)
     return xarray.Dataset(found)
 
@@ -549,7 +419,7 @@ def units_along(
         expected = f"a function of {result.name} that returns the Machine at a value of it"
         require(not isinstance(machine, Machine | Units), "machine", expected, "one Machine")
         return _units_at(machine, given), ("", 1.0)
-    units, kept = units_of(machine), _at_first_value(result)
+    units, (_, kept) = units_of(machine), _at_first_value(result)
     osc: Any = machine.oscillator if isinstance(machine, Machine) else kept
     require(osc is not None, "machine", "a Machine, as the result keeps no oscillator", "its units")
     name, belts = result.name, len(osc.belts)
@@ -562,33 +432,28 @@ def units_along(
 
 def _dataset(dataset: "xarray.Dataset", machine: Any) -> "xarray.Dataset":
     axes = [str(name) for name in dataset.dims if name in dataset.coords]
-    own = [name for name in axes if name not in ("x1", "x2", "belt")]
+    own = [name for name in axes if name not in ("x1", "x2", "belt", "attractor")]
     units = _units_of_runs(dataset, machine, own)
-    vary = sorted(name for name in SYMBOLS if np.ptp(np.asarray(getattr(units, name))) > 0)
+    vary = sorted(name for name, unit in vars(units).items() if np.ptp(np.asarray(unit)) > 0)
     changed = {}
-    for name in [*map(str, dataset.data_vars), *(axis for axis in axes if axis in DIMENSIONS)]:
-        of, _, by = name.removeprefix("d_").partition("_d_") if name[:2] == "d_" else (name, "", "")
-        if of not in DIMENSIONS:
-            continue
+    for name, quantity in quantities_of(dataset).items():
+        of, _, by = quantity.partition(" / ")
+        require_one_of(of, SI_UNITS, f"quantity of {name}")
+        (symbol, size), is_axis = SI_UNITS[of], name in dataset.coords
         # Units that vary with a parameter have a derivative, too; and the starts are one axis.
-        fits = not vary or (of == name and name not in axes)
+        fits = not vary or not (by or is_axis)
         require(fits, "result", f"without {name} where the units of {', '.join(vary)} vary", name)
-        unit = getattr(units, DIMENSIONS[of])
-        attributes = {"units": SYMBOLS[DIMENSIONS[of]]}
-        if by in DIMENSIONS:
-            unit = unit / getattr(units, DIMENSIONS[by])
-            attributes["units"] += f" / ({SYMBOLS[DIMENSIONS[by]]})"
-        elif by:
-            attributes["units"] += f" / (unit of {by})"
-        if name in axes:
-            unit = float(np.ravel(unit)[0])
+        divisor, divisor_size = SI_UNITS.get(by, (by, lambda _: 1.0))
+        unit = size(units) / divisor_size(units)
         old = dataset[name]
-        values = (old * unit).transpose(*old.dims).values
-        changed[name] = (old.dims, values, old.attrs | attributes)
+        values = old * (float(np.ravel(unit)[0]) if is_axis else unit)
+        attributes = old.attrs | {"units": f"{symbol} / ({divisor})" if by else symbol}
+        attributes.pop("quantity", None)
+        changed[name] = (old.dims, values.transpose(*old.dims).values, attributes)
     if words := dataset["label"].attrs.get("flag_meanings") if "label" in dataset else None:
-        in_m = " ".join(rest_in_m(word, units).replace(" ", "_") for word in words.split())
+        in_m = " ".join(rest_in_m(word, units.length).replace(" ", "_") for word in words.split())
         changed["label"] = dataset["label"].assign_attrs(flag_meanings=in_m).variable
-    coordinates = {name: changed.pop(name) for name in axes if name in changed}
+    coordinates = {name: changed.pop(name) for name in [*changed] if name in dataset.coords}
     notes = {"units": "SI where a variable says so; else dimensionless"}
     if str(start := dataset.attrs.get("start", "")).startswith("x"):  # not along the axes
         notes["start"] = f"dimensionless: {start}"

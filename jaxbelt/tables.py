@@ -17,13 +17,22 @@ if TYPE_CHECKING:
     import pandas
 
 
-def table_of(rows: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> "pandas.DataFrame":
-    """A table from columns by name, or from rows that have the same names."""
+def table_of(
+    rows: Mapping[str, Any] | Sequence[Mapping[str, Any]],
+    quantities: Mapping[str, str] | None = None,
+) -> "pandas.DataFrame":
+    """A table from columns by name, or from rows that have the same names.
+
+    quantities: dimensions of columns, for `in_si`; they stand in the attributes of the table.
+    """
     import pandas  # import takes a quarter of a second, which only tables need
 
     if isinstance(rows, Mapping):
-        return pandas.DataFrame({name: np.asarray(column) for name, column in rows.items()})
-    return pandas.DataFrame(list(rows))
+        table = pandas.DataFrame({name: np.asarray(column) for name, column in rows.items()})
+    else:
+        table = pandas.DataFrame(list(rows))
+    table.attrs["quantities"] = dict(quantities or {})
+    return table
 
 
 def per_belt(name: str, values: Any) -> dict[str, Any]:

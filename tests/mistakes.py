@@ -683,6 +683,7 @@ MISTAKES = [
         r"vary must be one of nu0, nu1, zeta, or a path such as \S+ or \S+, got .*steepness'",
     ),
     ("jaxbelt diagram --vary sigma", "class b must have only nu0, nu1, got sigma"),
+    ("jaxbelt orbits --class q", "class must be a, b, c or d, got q"),
     ("jaxbelt diagram --span 1 0", r"span must be FROM TO with FROM < TO, got 1\.0 0\.0"),
     ("jaxbelt diagram --quantity x3", "quantity must be one of .*, got x3"),
     ("jaxbelt map --axes nu0 nu0", "axes must be different ones, got nu0 twice"),

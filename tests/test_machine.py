@@ -363,7 +363,11 @@ def test_without_forces_there_are_units_all_the_same():
 def swept(axes, make):
     """Final states of its oscillators; derivatives are numbers like any other here."""
     found = jb.sweep(make, axes, y0=(3.0, 0.0), t1=50.0)
-    return found.assign(d_x2_end_d_x1=found.x2_end, d_x1_end_d_V=found.x1_end)
+    slopes = {
+        "d_x2_end_d_x1": found.x2_end.assign_attrs(quantity="velocity / length"),
+        "d_x1_end_d_V": found.x1_end.assign_attrs(quantity="length / unit of V"),
+    }
+    return found.assign(slopes)
 
 
 @pytest.mark.slow(first=True)
@@ -385,6 +389,50 @@ def test_sweeps_in_si():
         jb.in_si(
             dataset.drop_vars(["d_x2_end_d_x1", "d_x1_end_d_V"]), lambda V: machine(V, 500 * V)
         )
+
+
+@pytest.mark.slow(first=True)
+def test_variables_of_sweeps_state_their_dimensions():
+    """Those of stores of earlier versions do not; they are converted all the same."""
+    axes = {"V": np.array([0.01, 0.02]), "x1": np.array([1.0, 2.0])}
+    dataset = jb.sweep(
+        lambda V: machine(V).oscillator, axes, t1=50.0, derivatives=("V", "x1"), rtol=1e-6
+    )
+    assert dataset.x1.quantity == dataset.x1_end.quantity == "length"
+    assert dataset.d_x2_end_d_x1.quantity == "velocity / length"
+    assert dataset.d_x2_end_d_V.quantity == "velocity / unit of V"
+    assert not {"quantity"} & {*dataset.V.attrs, *dataset.n_events.attrs, *dataset.status.attrs}
+    units, ours = machine().units, jb.in_si(dataset, machine)
+    assert ours.d_x2_end_d_x1.units == "m s-1 / (m)" and "quantity" not in ours.x1.attrs
+    slopes = dataset.d_x2_end_d_x1 * float(units.velocity / units.length)
+    assert np.allclose(ours.d_x2_end_d_x1, slopes, equal_nan=True)
+    earlier = dataset.copy()
+    for name in earlier.variables:
+        earlier[name].attrs.pop("quantity", None)
+    assert jb.in_si(earlier, machine).identical(ours)
+    one = jb.in_si(dataset.isel(x1=0), machine)
+    assert float(one.x1) == float(ours.x1[0]) and one.x1.units == "m"
+
+
+def test_results_of_ones_own_state_their_dimensions_where_they_are_to_be_converted():
+    axes = {"V": ("V", [0.01, 0.02])}
+    own = xr.Dataset({"x1": ("V", [1.0, 2.0])}, axes, {"observe": "Largest"})
+    assert jb.in_si(own, machine).x1.identical(own.x1)
+    own.x1.attrs["quantity"] = "length"
+    ours = jb.in_si(own, machine)
+    assert ours.x1.units == "m" and np.allclose(ours.x1, own.x1 * 5.0 / STIFFNESS, rtol=1e-14)
+    own.x1.attrs["quantity"] = "lenght"
+    with pytest.raises(ValueError, match=r"quantity of x1 must be .* \(did you mean 'length'"):
+        jb.in_si(own, machine)
+
+
+def test_attractors_of_a_sweep_take_the_function_of_the_sweep():
+    """The numbers of the attractors are no argument of it."""
+    axes = {"V": ("V", [0.01, 0.02]), "attractor": ("attractor", [0, 1])}
+    x1_max = (("V", "attractor"), np.array([[1.0, 2.0], [3.0, 4.0]]), {"quantity": "length"})
+    shares = xr.Dataset({"x1_max": x1_max}, axes, {"observe": "attractor"})
+    ours = jb.in_si(shares, machine)
+    assert ours.x1_max.units == "m" and np.allclose(ours.x1_max, shares.x1_max * 5.0 / STIFFNESS)
 
 
 @pytest.mark.slow(first=True)

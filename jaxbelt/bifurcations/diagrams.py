@@ -25,6 +25,7 @@ from ..cycles.clocked import turns_of
 from ..cycles.cycle import Cycle, warn_of_fast_loops
 from ..cycles.periodic import PeriodicMotion
 from ..cycles.unstable import from_starts
+from ..dimensions import EXTENT
 from ..model.events import signature_name
 from ..model.oscillator import Oscillator, has_clock
 from ..model.own_units import in_own_units, rescaled
@@ -96,7 +97,9 @@ class BifurcationDiagram(eqx.Module):
             for number, branch in enumerate(self.branches)
             for row in table_of(branch.columns()).to_dict("records")
         ]
-        table = table_of([*rows, *map(_row_of_point, self.points)])
+        sticks = {f"stick_duration_{i}": "time" for i in range(len(self.oscillator.belts))}
+        quantities = EXTENT | {"period": "time", "amplitude": "length"} | sticks
+        table = table_of([*rows, *map(_row_of_point, self.points)], quantities)
         # A point belongs to no branch, and is neither stable nor unstable.
         return (
             table.astype({"branch": "Int64", "stable": "boolean", "neutral": "boolean"})

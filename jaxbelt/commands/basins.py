@@ -1,6 +1,5 @@
 """`jaxbelt basins`: which start leads where."""
 
-import csv
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,15 +12,17 @@ from .options import (
     Interval,
     Json,
     Out,
+    check_least,
     check_range,
     describes,
     from_to,
-    make_console,
     outputs,
+    picture,
     plain_errors,
     say,
     turn_on_float64,
 )
+from .tables import write_columns
 
 
 @describes()
@@ -59,10 +60,8 @@ def basins(
     - jaxbelt basins --belt 1.4,law=stribeck,static=1,kinetic=0.5,stribeck_velocity=0.5
       --damping 0.1 --x1 -2 2 --x2 0 2
     """
-    console = make_console()
     with plain_errors():
-        if points < 2:
-            raise ValueError(f"points must be at least 2, got {points}")
+        check_least("points", points, 2)
         if starts < 0:
             raise ValueError(f"starts must be 0 or more, got {starts}")
         check_range("x1", x1)
@@ -89,20 +88,14 @@ def basins(
                 "fractions": stability.fractions,
                 "standard_errors": stability.standard_errors,
             }
-        from ..plotting.style import journal_style, save
-        from ..plotting.sweeps import draw_basins
-
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with journal_style():
-            save(draw_basins(found), written[0])
+        with picture(written[0], 4.6, 4.4) as figure:
+            jb.plot_basins(found, figure.subplots())
         # Version 3 of the format needs no library but SciPy.
         found.dataset.to_netcdf(written[2], engine="scipy")
-        with written[1].open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(["x1", "x2", "label"])
-            for (i, j), label in np.ndenumerate(np.asarray(found.label)):
-                writer.writerow([float(grid[0][i]), float(grid[1][j]), int(label)])
-    say(console, lines, written, as_json=as_json, data=data)
+        places = [one.ravel() for one in np.meshgrid(*grid, indexing="ij")]
+        columns = {"x1": places[0], "x2": places[1], "label": found.label.values.ravel()}
+        write_columns(columns, written[1])
+    say(lines, written, as_json=as_json, data=data)
 
 
 def _shares_as_data(found: "jb.Basins") -> dict[str, Any]:

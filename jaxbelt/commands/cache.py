@@ -1,10 +1,10 @@
 """`jaxbelt cache`: compiled programs on disk."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from .options import Json, make_console, plain_errors, say
+from .options import Json, plain_errors, say
 
 
 def cache(
@@ -23,14 +23,19 @@ def cache(
     from ..numerics import programs
 
     with plain_errors():
-        folder = programs.folder()
         removed = programs.clear() if clear else 0
-        found = programs.entries()
+        words, data = what_is_kept()
+    lines = [f"{removed} programs removed"] * clear + [words]
+    say(lines, as_json=as_json, data=data | {"removed": removed})
+
+
+def what_is_kept() -> tuple[str, dict[str, Any]]:
+    """The folder of compiled programs, their number and size, in words and as data."""
+    from ..numerics import programs
+
+    folder, found = programs.folder(), programs.entries()
     size = sum(one.size for one in found)
-    lines = [f"{len(found)} programs, {size / 2**20:.1f} MiB, in {folder}"]
+    words = f"{len(found)} programs, {size / 2**20:.1f} MiB, in {folder}"
     if folder is None:
-        lines = ["nothing is kept: it is switched off, or the folder cannot be used"]
-    if clear:
-        lines.insert(0, f"{removed} programs removed")
-    data = dict(folder=folder and str(folder), programs=len(found), bytes=size, removed=removed)
-    say(make_console(), lines, [], as_json=as_json, data=data)
+        words = "nothing is kept: it is switched off, or the folder cannot be used"
+    return words, dict(folder=folder and str(folder), programs=len(found), bytes=size)

@@ -1,7 +1,5 @@
 """`jaxbelt diagram`: equilibria, cycles and bifurcation points along a parameter."""
 
-import operator
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,18 +16,19 @@ from .options import (
     Vary,
     VarySpan,
     as_json_value,
+    check_least,
     check_range,
+    check_word,
     describes,
-    make_console,
+    option,
     outputs,
+    picture,
     plain_errors,
     say,
     turn_on_float64,
 )
 from .tables import headed, in_columns, write_columns
 
-#: Arguments of classes that may be varied besides velocities: an edge of two belts, or of one.
-EDGES = ("sigma", "sigma0", "sigma1")
 #: Quantities that a diagram can show.
 DRAWABLE = ("amplitude", "x1", "x2", "period")
 #: Fields of a branch that are columns of the table.
@@ -53,9 +52,9 @@ def diagram(
     rows: Annotated[int, typer.Option(help="About how many values are computed.")] = 160,
     quantity: Annotated[
         str | None,
-        typer.Option(
-            help="What is drawn: amplitude, x1, x2 or period.",
-            show_default="amplitude where a cycle sticks, else x2, or x1 where there is no cycle",
+        option(
+            "What is drawn: amplitude, x1, x2 or period.",
+            "amplitude where a cycle sticks, else x2, or x1 where there is no cycle",
         ),
     ] = None,
     out: Out = Path("diagram"),
@@ -91,34 +90,28 @@ def diagram(
 
     - jaxbelt diagram --file machine.toml --vary "belts[0].velocity" --span 0.05 0.3
     """
-    console = make_console()
     with plain_errors():
-        if rows < 1:
-            raise ValueError(f"rows must be at least 1, got {rows}")
-        if quantity is not None and quantity not in DRAWABLE:
-            raise ValueError(f"quantity must be one of {', '.join(DRAWABLE)}, got {quantity}")
+        check_least("rows", rows, 1)
+        if quantity is not None:
+            check_word("quantity", quantity, DRAWABLE)
         check_range("span", span)
         written = outputs(out, ".png", ".csv", "_points.csv")
-        described.check(**({parameter: span[0]} if parameter in EDGES else {}))
         described.check_parameter(parameter)
         turn_on_float64()
         given = None if start is None else described.start(start)
         path = described.path_along(parameter, span)
         found = jb.bifurcation_diagram(*path, start=given, rows=rows)
-        if parameter in EDGES:
+        if path[1] is None:
             found = replace(found, name=parameter)
         from ..plotting.diagrams import plot_diagram
-        from ..plotting.style import draw_key, journal_figure, journal_style, save
+        from ..plotting.style import draw_key
 
-        with journal_style():
-            figure = journal_figure(7.2, 4.2)
+        with picture(written[0], 7.2, 4.2) as figure:
             if described.machine:
                 jb.plot_in_si(found, described.machine, figure.subplots(), quantity=quantity)
             else:
                 plot_diagram(found, figure.subplots(), quantity=quantity)
                 draw_key(figure)
-            out.parent.mkdir(parents=True, exist_ok=True)
-            save(figure, written[0])
         unit = described.unit(parameter)
         write_columns(branches_of(found, described.machine), written[1])
         points = points_of(found.points, *unit)
@@ -135,7 +128,7 @@ def diagram(
         lines += [
             ", ".join(f"{k} {v}" for k, v in row.items() if v != "") for row in rows_of_points
         ]
-    say(console, lines, written, as_json=as_json, data=data)
+    say(lines, written, as_json=as_json, data=data)
 
 
 def points_of(points: "tuple[jb.BifurcationPoint, ...]", unit: str, size: float) -> dict[str, Any]:
@@ -166,23 +159,12 @@ def branches_of(found: "jb.BifurcationDiagram", machine: "jb.Machine | None") ->
 
     With a machine they are in SI units.
     """
-    belts, branches = range(len(found.oscillator.belts)), found.branches
+    sticks = (f"stick_duration_{i}" for i in range(len(found.oscillator.belts)))
+    names = ["branch", "kind", "value", *FIELDS, *sticks]
     if machine:
         rows = jb.in_si(found, machine)
-        names = ["branch", "kind", "value", *FIELDS, *(f"stick_duration_{i}" for i in belts)]
         columns = in_columns(rows.isel(row=rows.branch.values >= 0), names)
-        return {name.replace("duration_", "duration"): one for name, one in columns.items()}
-
-    def joined(column: Callable[[Any], Any]) -> list[Any]:
-        return [entry for branch in branches for entry in column(branch).tolist()]
-
-    counted = [
-        (number, branch.kind) for number, branch in enumerate(branches) for _ in branch.values
-    ]
-    return {
-        "branch": [number for number, _ in counted],
-        "kind": [kind for _, kind in counted],
-        "value": joined(lambda branch: branch.values),
-        **{name: joined(operator.attrgetter(name)) for name in FIELDS},
-        **{f"stick_duration{i}": joined(lambda one, i=i: one.stick_durations[:, i]) for i in belts},
-    }
+    else:
+        table: Any = found.table().reindex(columns=names)
+        columns = dict(table[table.branch.notna()].items())
+    return {name.replace("duration_", "duration"): one for name, one in columns.items()}

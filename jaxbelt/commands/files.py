@@ -241,7 +241,7 @@ class FromFile:
             return "", 1.0
         import jax
 
-        from ..si import unit_of
+        from ..model.parameters import unit_of
 
         with jax.ensure_compile_time_eval():
             return unit_of(self.paths[name], self.own, self.machine.units)

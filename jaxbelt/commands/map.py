@@ -1,8 +1,7 @@
 """`jaxbelt map`: the regions of a plane of two parameters."""
 
-import csv
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -13,16 +12,17 @@ from .options import (
     Interval,
     Json,
     Out,
+    check_least,
     check_range,
     describes,
     from_to,
-    make_console,
     outputs,
+    picture,
     plain_errors,
     say,
     turn_on_float64,
 )
-from .tables import write_table
+from .tables import write_columns, write_table
 
 
 @describes()
@@ -63,12 +63,10 @@ def region_map(
 
     - jaxbelt map --axes nu0 zeta --p 0 0.6 --q 0.1 1 --nu1 0.35
     """
-    console = make_console()
     with plain_errors():
         described.refuse_machine("map")
         described.check_axes(axes)
-        if cells < 2:
-            raise ValueError(f"cells must be at least 2, got {cells}")
+        check_least("cells", cells, 2)
         check_range("p", p)
         check_range("q", q)
         written = outputs(out, ".png", ".csv", "_curves.csv")
@@ -80,20 +78,16 @@ def region_map(
         values = {name: evenly_spaced(*span, n) for name, span, n in pairs}
         found = jb.region_map(make, values)
         from ..plotting.regions import draw_region_map
-        from ..plotting.style import journal_figure, journal_style, save
 
-        with journal_style():
-            figure = journal_figure(7.2, 9.0)
+        with picture(written[0], 7.2, 9.0) as figure:
             draw_region_map(found, figure)
-            out.parent.mkdir(parents=True, exist_ok=True)
-            save(figure, written[0])
         write_cells(found, written[1])
         write_table(found.table(), written[2])
     cells_of = {name: int((found.label == name).sum()) for name in found.regions}
     words = {name: found.words[name] for name in cells_of}
     data = {"axes": list(found.names), "cells": cells_of, "words": words}
     data["curves"] = len(found.curves)
-    say(console, [repr(found)], written, as_json=as_json, data=data)
+    say([repr(found)], written, as_json=as_json, data=data)
 
 
 def cells_along(cells: int) -> tuple[int, int]:
@@ -109,11 +103,12 @@ def cells_along(cells: int) -> tuple[int, int]:
 def write_cells(found: "jb.RegionMap", path: Path) -> None:
     """Writes both parameters, name and meaning of the region, and `on_line`, a row for each
     cell."""
-    first, second = (values.tolist() for values in found.values)
+    import numpy as np
+
+    places = [one.ravel() for one in np.meshgrid(*found.values, indexing="ij")]
+    columns: dict[str, Any] = dict(zip(found.names, places, strict=True))
+    columns["region"] = found.label.ravel()
     words = {"": "undecided", **found.words}
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow([*found.names, "region", "words", "on_line"])
-        for p, names, lines in zip(first, found.label, found.on_line, strict=True):
-            cells = zip(second, names, lines, strict=True)
-            writer.writerows([p, q, name, words[name], int(line)] for q, name, line in cells)
+    columns["words"] = [words[name] for name in columns["region"]]
+    columns["on_line"] = found.on_line.ravel().astype(int)
+    write_columns(columns, path)

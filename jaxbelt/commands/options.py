@@ -15,7 +15,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -23,6 +23,7 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 import jaxbelt as jb
 
@@ -37,6 +38,8 @@ CLASSES = {
     "c": {"nu0": 0.2, "nu1": 0.4, "sigma": 0.8},
     "d": {"nu0": 0.2, "nu1": 0.4, "sigma0": 0.5, "sigma1": 1.0},
 }
+#: Arguments of classes that are edges: of two belts, or of one.
+EDGES = ("sigma", "sigma0", "sigma1")
 
 
 @contextmanager
@@ -126,6 +129,19 @@ def check_out(out: Path) -> None:
         raise OSError(f"out must be a place that can be written to, got {out}") from None
 
 
+def check_least(name: str, value: int, least: int) -> None:
+    """Raises unless an integer is as large as that, or larger."""
+    if value < least:
+        raise ValueError(f"{name} must be at least {least}, got {value}")
+
+
+def check_word(name: str, word: str, known: Collection[str]) -> None:
+    """Raises unless a word is one of those that are known; suggests one."""
+    if word not in known:
+        meant = did_you_mean(word, known)
+        raise ValueError(f"{name} must be one of {', '.join(known)}, got {word}{meant}")
+
+
 def check_number(name: str, value: float) -> None:
     """Raises unless a number is finite and > 0, like the package itself, but before it is
     imported."""
@@ -163,21 +179,35 @@ def make_console() -> Console:
     return console if console.is_terminal else Console(width=200)
 
 
+def steps_bar(console: Console, width: int, hidden: bool) -> Progress:
+    """A bar of steps with their names, of a width in letters."""
+    name = TextColumn(f"{{task.description:<{width}}}")
+    columns = name, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    return Progress(*columns, console=console, disable=hidden)
+
+
 def say(
-    console: Console,
-    lines: Iterable[str],
-    written: Iterable[Path],
-    *,
-    as_json: bool = False,
-    data: dict[str, Any] | None = None,
+    lines: Iterable[str], written: Iterable[Path] = (), *, as_json: bool, data: dict[str, Any]
 ) -> None:
     """Prints lines and the files that were written; or `data`, with these, as JSON."""
     if as_json:
-        print(json.dumps({**(data or {}), "written": [str(path) for path in written]}))
+        print(json.dumps({**data, "written": [str(path) for path in written]}))
         return
-    files = ", ".join(map(str, written))
+    console, files = make_console(), ", ".join(map(str, written))
     for line in (*lines, *([f"Written: {files}"] if files else [])):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def picture(path: Path, width: float, height: float) -> Iterator[Any]:
+    """An empty figure in the style of a journal, size in inches; it is written once drawn."""
+    from ..plotting.style import journal_figure, journal_style, save
+
+    with journal_style():
+        figure = journal_figure(width, height)
+        yield figure
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save(figure, path)
 
 
 def as_json_value(value: Any) -> Any:
@@ -199,8 +229,13 @@ def _of_classes(name: str) -> str:
     return "; ".join(f"{value} in {', '.join(names)}" for value, names in values.items())
 
 
+def option(text: str, default: str) -> Any:
+    """Option with this help, and words for its default."""
+    return typer.Option(help=text, show_default=default)
+
+
 def _argument(name: str, text: str) -> Any:
-    return typer.Option(help=text, show_default=_of_classes(name))
+    return option(text, _of_classes(name))
 
 
 Class = Annotated[str, typer.Option("--class", help="The paper's class of contact: a, b, c or d.")]
@@ -229,10 +264,10 @@ Forces = Annotated[
 ]
 File = Annotated[
     Path | None,
-    typer.Option(
-        help="A TOML file that describes the oscillator, or a machine in SI units, instead of all "
-        "these options: see **jaxbelt simulate --help**.",
-        show_default="none",
+    option(
+        "A TOML file that describes the oscillator, or a machine in SI units, instead of all these "
+        "options: see **jaxbelt simulate --help**.",
+        "none",
     ),
 ]
 Damping = Annotated[float, typer.Option(help="zeta = c / sqrt(k m).")]
@@ -263,6 +298,12 @@ Out = Annotated[
 def from_to(text: str) -> Any:
     """Option of an interval, FROM TO, with this help."""
     return typer.Option(metavar="FROM TO", help=text)
+
+
+def tolerance_of(default: str) -> Any:
+    """Option of the tolerance of a step; default: of the relative one."""
+    text = "Relative and absolute tolerance of the integrator; of a machine the latter is in "
+    return option(f"{text}max N / k.", f"{default}, the absolute one of the oscillator's own size")
 
 
 Vary = Annotated[
@@ -342,37 +383,39 @@ class Description:
     @property
     def arguments(self) -> dict[str, float | None]:
         """Arguments of the class, None where one is not given."""
-        return {name: getattr(self, name) for name in ("nu0", "nu1", "sigma", "sigma0", "sigma1")}
+        return {name: getattr(self, name) for name in ("nu0", "nu1", *EDGES)}
 
     @property
     def short_names(self) -> tuple[str, ...]:
         """Names of the arguments of the class; none for belts in full."""
         return () if self.belt or self.file else tuple(CLASSES[self.system])
 
-    def check(self, **varied: float) -> None:
+    def check(self, *varied: str) -> None:
         """Raises unless the options describe belts; the classes themselves check numbers.
 
-        varied: values of arguments of the class that vary.
+        varied: parameters that vary. An edge of class (c) or (d) among them is an argument, too.
         """
         if self.source:
             return
         for text in self.force or ():
             parts_of_force(text)
-        given = _given(self.arguments | varied)
+        given = _given(self.arguments) | dict.fromkeys(name for name in varied if name in EDGES)
         if self.belt:
             if given:
                 raise ValueError(f"with --belt no class must be described, got {', '.join(given)}")
             for text in self.belt:
                 parts_of_belt(text)
             return
-        check_class(self.system)
+        if self.system not in CLASSES:
+            raise ValueError(f"class must be a, b, c or d, got {self.system}")
         for name in given:
             if name not in self.short_names:
                 known = ", ".join(self.short_names)
                 raise ValueError(f"class {self.system} must have only {known}, got {name}")
 
     def check_parameter(self, name: str) -> None:
-        """Raises unless a parameter along which something is computed is known."""
+        """Raises unless belts are described, and the parameter that is to vary is known."""
+        self.check(name)
         paths, short = self.parameters(), self.short_names
         if name not in (*short, *paths):
             known, meant = names_in_words(short, paths), did_you_mean(name, (*short, *paths))
@@ -537,12 +580,6 @@ def _parameters(
 
 def _given(arguments: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in arguments.items() if value is not None}
-
-
-def check_class(system: str) -> None:
-    """Raises unless it is one of the paper's classes."""
-    if system not in CLASSES:
-        raise ValueError(f"class must be a, b, c or d, got {system}")
 
 
 def names_in_words(names: Iterable[str], paths: dict[str, str]) -> str:

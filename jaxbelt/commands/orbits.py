@@ -9,7 +9,6 @@ import typer
 
 import jaxbelt as jb
 
-from ..spelling import did_you_mean
 from .options import (
     Description,
     Json,
@@ -17,17 +16,17 @@ from .options import (
     Start,
     Vary,
     VarySpan,
+    check_least,
     check_range,
+    check_word,
     describes,
-    make_console,
     outputs,
+    picture,
     plain_errors,
     say,
     turn_on_float64,
 )
 from .tables import headed, in_columns, write_columns
-
-COORDINATES = ("x1", "x2")
 
 
 @describes()
@@ -83,17 +82,12 @@ def orbits(
 
     - jaxbelt orbits --file machine.toml --vary "belts[0].normal_force" --span 5 30
     """
-    console = make_console()
     with plain_errors():
-        if rows < 2:
-            raise ValueError(f"rows must be at least 2, got {rows}")
-        if quantity not in COORDINATES:
-            meant = did_you_mean(quantity, COORDINATES)
-            raise ValueError(f"quantity must be x1 or x2, got {quantity}{meant}")
+        check_least("rows", rows, 2)
+        check_word("quantity", quantity, ("x1", "x2"))
         check_range("span", span)
         further = list(map(parse_start, also or ()))
         written = outputs(out, ".png", ".csv")
-        described.check(**({parameter: span[0]} if parameter in described.short_names else {}))
         described.check_parameter(parameter)
         turn_on_float64()
         y0 = [described.start(one) for one in (start, *further)]
@@ -102,19 +96,13 @@ def orbits(
         found = jb.orbit_diagram(*path, at=at, y0=y0, rows=rows, sense=sense)
         if path[1] is None:
             found = replace(found, name=parameter)
-        from ..plotting.style import journal_figure, journal_style, save
-
-        with journal_style():
-            figure = journal_figure(7.2, 4.2)
+        with picture(written[0], 7.2, 4.2) as figure:
             ax = figure.subplots()
             if described.machine:
                 jb.plot_in_si(found, described.machine, ax, quantity=quantity)
             else:
                 found.plot(ax, quantity=quantity)
-            out.parent.mkdir(parents=True, exist_ok=True)
-            save(figure, written[0])
-        table: Any = found.table()
-        columns = {str(name): table[name].tolist() for name in table}
+        columns: dict[str, Any] = {str(name): one for name, one in found.table().items()}
         if described.machine:
             columns = in_columns(jb.in_si(found, described.machine), [*columns])
         write_columns(columns, written[1])
@@ -128,7 +116,7 @@ def orbits(
         ends = f"{span[0]:g} to {span[1]:g}"
         lines = [f"{headed(parameter, symbol)} from {ends}, {len(kinds)} runs: {words}"]
         data["unit"] = symbol
-    say(console, lines, written, as_json=as_json, data=data)
+    say(lines, written, as_json=as_json, data=data)
 
 
 def parse_start(text: str) -> tuple[float, float]:

@@ -5,9 +5,8 @@ from typing import Annotated
 
 import rich.table
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from .options import Json, check_out, make_console, plain_errors, say, turn_on_float64
+from .options import Json, check_out, make_console, plain_errors, say, steps_bar, turn_on_float64
 
 
 def reproduce(
@@ -34,13 +33,7 @@ def reproduce(
     # Imported late, because matplotlib comes with it, to keep `--help` quick.
     from .. import paper
 
-    columns = (
-        TextColumn("{task.description:<32}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-    )
-    with plain_errors(), Progress(*columns, console=console, disable=as_json) as progress:
+    with plain_errors(), steps_bar(console, 32, as_json) as progress:
         task = progress.add_task("", total=paper.steps())
         started = False
 
@@ -54,7 +47,7 @@ def reproduce(
     if as_json:
         names = ["critical_values.json", *(f"{name}.png" for name in paper.FIGURES)]
         data = {"critical_values": paper.table_as_json(values)}
-        say(console, [], [out / name for name in names], as_json=True, data=data)
+        say([], [out / name for name in names], as_json=True, data=data)
         return
     console.print(_rich_table(values))
     for line in (

@@ -7,25 +7,25 @@ import typer
 
 import jaxbelt as jb
 
-from ..spelling import did_you_mean
 from .options import (
     Description,
     Json,
     Out,
     Start,
     as_json_value,
+    check_least,
     check_number,
+    check_word,
     describes,
-    make_console,
+    option,
     outputs,
     plain_errors,
     say,
+    tolerance_of,
     tolerances,
     turn_on_float64,
 )
 from .tables import in_columns, write_columns
-
-FORMULATIONS = ("filippov", "switch", "smooth")
 
 
 @describes()
@@ -34,10 +34,7 @@ def simulate(
     start: Start = None,
     t1: Annotated[
         float | None,
-        typer.Option(
-            help="End of the time span, which begins at 0; of a machine in s.",
-            show_default="100, dimensionless",
-        ),
+        option("End of the time span, which begins at 0; of a machine in s.", "100, dimensionless"),
     ] = None,
     samples: Annotated[
         int, typer.Option(help="How many times, evenly spread over the span, are written.")
@@ -50,26 +47,12 @@ def simulate(
     ] = "filippov",
     v_star: Annotated[
         float | None,
-        typer.Option(
-            help="Half-width of the switch model's band, a velocity.",
-            show_default="0.001, dimensionless",
-        ),
+        option("Half-width of the switch model's band, a velocity.", "0.001, dimensionless"),
     ] = None,
     eps: Annotated[
-        float | None,
-        typer.Option(
-            help="Width of the smooth model's tanh, likewise.",
-            show_default="0.001, dimensionless",
-        ),
+        float | None, option("Width of the smooth model's tanh, likewise.", "0.001, dimensionless")
     ] = None,
-    tolerance: Annotated[
-        float | None,
-        typer.Option(
-            help="Relative and absolute tolerance of the integrator; of a machine the latter is in "
-            "max N / k.",
-            show_default="1e-10, the absolute one of the oscillator's own size",
-        ),
-    ] = None,
+    tolerance: Annotated[float | None, tolerance_of("1e-10")] = None,
     out: Out = Path("trajectory"),
     as_json: Json = False,
 ) -> None:
@@ -138,14 +121,9 @@ def simulate(
 
     - jaxbelt simulate --file machine.toml --start 0.05 0 --t1 4
     """
-    console = make_console()
     with plain_errors():
-        if samples < 2:
-            raise ValueError(f"samples must be at least 2, got {samples}")
-        if formulation not in FORMULATIONS:
-            meant = did_you_mean(formulation, FORMULATIONS)
-            names = ", ".join(FORMULATIONS)
-            raise ValueError(f"formulation must be one of {names}, got {formulation}{meant}")
+        check_least("samples", samples, 2)
+        check_word("formulation", formulation, ("filippov", "switch", "smooth"))
         if t1 is not None:
             check_number("t1", t1)
         asked: dict[str, Any] = tolerances(tolerance)
@@ -186,7 +164,7 @@ def simulate(
         ends = ", ".join(f"{name} {value:.6g}" for name, value in last.items() if value is not None)
         lines = [f"ends at {ends}; {trajectory.events!r}, status {status.name}: "]
         lines[0] += jb.describe(trajectory.status)
-    say(console, lines, written, as_json=as_json, data=data)
+    say(lines, written, as_json=as_json, data=data)
     if int(trajectory.status) >= jb.Status.TOO_MANY_SEGMENTS:
         raise typer.Exit(1)
 

@@ -9,7 +9,6 @@ import typer
 
 import jaxbelt as jb
 
-from ..spelling import did_you_mean
 from .files import FromFile
 from .options import (
     Description,
@@ -17,10 +16,13 @@ from .options import (
     Start,
     check_number,
     check_out,
+    check_word,
     describes,
-    make_console,
+    option,
+    picture,
     plain_errors,
     say,
+    tolerance_of,
     tolerances,
     turn_on_float64,
 )
@@ -70,27 +72,19 @@ def sweep(
     ] = "attractor",
     variable: Annotated[
         str | None,
-        typer.Option(
-            help="What the picture shows, a variable of the dataset.",
-            show_default="kind, of the final state x1_end",
+        option(
+            "What the picture shows, a variable of the dataset.", "kind, of the final state x1_end"
         ),
     ] = None,
     start: Start = None,
     t1: Annotated[
         float | None,
-        typer.Option(
-            help="End of each run; of a machine in s.",
-            show_default="30000 for attractors, 100 for the final state, 1000 for exponents",
+        option(
+            "End of each run; of a machine in s.",
+            "30000 for attractors, 100 for the final state, 1000 for exponents",
         ),
     ] = None,
-    tolerance: Annotated[
-        float | None,
-        typer.Option(
-            help="Relative and absolute tolerance of the integrator; of a machine the latter is in "
-            "max N / k.",
-            show_default="1e-8, the absolute one of the oscillator's own size",
-        ),
-    ] = None,
+    tolerance: Annotated[float | None, tolerance_of("1e-8")] = None,
     out: Annotated[
         Path,
         typer.Option(
@@ -139,7 +133,6 @@ def sweep(
 
     - jaxbelt sweep nu0=-0.7:0.7:8192 nu1=-0.7:0.7:8192 --out plane.zarr --blocks 0:64
     """
-    console = make_console()
     with plain_errors():
         if out.suffix not in (".nc", ".zarr"):
             raise ValueError(f"out must end in .nc or .zarr, got {out}")
@@ -150,12 +143,10 @@ def sweep(
         described.check_axes([name for name, _ in parsed], others=("x1", "x2"))
         values = dict(parsed)
         known = VARIABLES_FORCED if described.is_forced else VARIABLES
-        if observe not in known:
-            meant = did_you_mean(observe, known)
-            raise ValueError(f"observe must be {' or '.join(known)}, got {observe}{meant}")
+        check_word("observe", observe, known)
         shown = variable or known[observe][0]
         drawn = part is None and sum(len(axis) > 1 for axis in values.values()) in (1, 2)
-        _check_variable(shown, known[observe])
+        check_word("variable", shown, [name for name in known[observe] if name not in OF_BELTS])
         machine = described.machine
         if machine and out.suffix == ".zarr":
             expected = "a store keeps dimensionless numbers"
@@ -178,7 +169,7 @@ def sweep(
                 values[name] = [described.dimensionless(one, quantity) for one in values[name]]
         if dry_run:
             estimate = jb.explain(make, values, **asked)
-            say(console, [repr(estimate)], [], as_json=as_json, data=asdict(estimate))
+            say([repr(estimate)], as_json=as_json, data=asdict(estimate))
             return
         if out.suffix == ".zarr":
             dataset = jb.sweep(make, values, **asked, store=out, blocks=part)
@@ -192,8 +183,11 @@ def sweep(
         written = [out]
         if drawn:
             written.append(out.with_suffix(".png"))
-            _draw_variable(dataset, shown, written[1])
-    say(console, [repr(dataset)], written, as_json=as_json, data=_counts_as_data(dataset))
+            from ..plotting.sweeps import plot_sweep
+
+            with picture(written[1], 4.6, 4.4) as figure:
+                plot_sweep(dataset, shown, figure.subplots())
+    say([repr(dataset)], written, as_json=as_json, data=_counts_as_data(dataset))
 
 
 def _of_machine(dataset: Any, source: FromFile, axes: list[str], y0: tuple[float, float]) -> Any:
@@ -215,30 +209,12 @@ def _of_machine(dataset: Any, source: FromFile, axes: list[str], y0: tuple[float
     return found.assign_attrs(machine=repr(machine))
 
 
-def _check_variable(name: str, variables: tuple[str, ...]) -> None:
-    """Raises unless the picture can show that variable."""
-    known = [one for one in variables if one not in OF_BELTS]
-    if name not in known:
-        meant = did_you_mean(name, known)
-        raise ValueError(f"variable must be one of {', '.join(known)}, got {name}{meant}")
-
-
 def _counts_as_data(dataset: Any) -> dict[str, Any]:
     """Number of runs, and how they ended."""
     statuses = jb.decoded(dataset[["status"]]).status.values.ravel().tolist()
     counts = {name or "not run": statuses.count(name) for name in sorted(set(statuses))}
     sizes = {str(name): size for name, size in dataset.sizes.items()}
     return {"sizes": sizes, "variables": [str(name) for name in dataset], "status": counts}
-
-
-def _draw_variable(dataset: Any, variable: str, out: Path) -> None:
-    from ..plotting.style import journal_figure, journal_style, save
-    from ..plotting.sweeps import plot_sweep
-
-    with journal_style():
-        figure = journal_figure(4.6, 4.4)
-        plot_sweep(dataset, variable, figure.subplots())
-        save(figure, out)
 
 
 def parse_blocks(text: str) -> tuple[int, int]:

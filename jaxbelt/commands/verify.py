@@ -8,7 +8,7 @@ import typer
 
 import jaxbelt as jb
 
-from .options import Json, make_console, plain_errors, say, turn_on_float64
+from .options import Json, plain_errors, say, turn_on_float64
 
 
 def verify(
@@ -30,6 +30,6 @@ def verify(
             raise ValueError(f"store must be a folder that sweep wrote, got {store}")
         turn_on_float64()
         found = jb.verify(store, repair)
-    say(make_console(), [repr(found)], [], as_json=as_json, data=asdict(found))
+    say([repr(found)], as_json=as_json, data=asdict(found))
     if found.bad and not repair:
         raise typer.Exit(1)

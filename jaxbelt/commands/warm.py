@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 import jaxbelt as jb
 
-from .options import Json, make_console, plain_errors, say, turn_on_float64
+from .cache import what_is_kept
+from .options import Json, make_console, plain_errors, say, steps_bar, turn_on_float64
 
 #: Start of the runs of the commands and of the paper.
 START = (3.0, 0.0)
@@ -37,7 +37,6 @@ def warm(
 
     Example: **jaxbelt warm**
     """
-    console = make_console()
     turn_on_float64()
     from ..numerics import programs
 
@@ -47,12 +46,11 @@ def warm(
                 "compiled programs must be kept on disk for this, but JAXBELT_CACHE=0 is set or "
                 "the folder cannot be used: see `jaxbelt cache`"
             )
-    columns = TextColumn("{task.description:<40}"), BarColumn(), MofNCompleteColumn()
     todo = jobs()
     jb.show_progress(False)
     with (
         plain_errors(),
-        Progress(*columns, TimeElapsedColumn(), console=console, disable=as_json) as progress,
+        steps_bar(make_console(), 40, as_json) as progress,
         ThreadPoolExecutor(threads or os.cpu_count()) as pool,
     ):
         task = progress.add_task("", total=len(todo))
@@ -68,11 +66,8 @@ def warm(
                 future.result()
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
-    found = programs.entries()
-    size = sum(one.size for one in found)
-    lines = [f"{len(found)} programs, {size / 2**20:.1f} MiB, in {programs.folder()}"]
-    data = dict(folder=str(programs.folder()), programs=len(found), bytes=size)
-    say(console, lines, [], as_json=as_json, data=data)
+    words, data = what_is_kept()
+    say([words], as_json=as_json, data=data)
 
 
 def jobs() -> list[tuple[str, Callable[[], Any]]]:

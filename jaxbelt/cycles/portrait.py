@@ -18,6 +18,7 @@ from jaxtyping import Array
 
 from ..activity import announced
 from ..checks import outside_of_traces, pick
+from ..dimensions import EXTENT
 from ..model.equilibria import Equilibria, EquilibriumKind, equilibria
 from ..model.events import signature_name
 from ..model.modes import edges
@@ -116,7 +117,7 @@ class Portrait(eqx.Module):
             _row("separatrix", number, f"{one.end} {one.to}", one.stable, np.asarray(one.ys))
             for number, one in enumerate(self.separatrices)
         ]
-        return table_of(rows)
+        return table_of(rows, EXTENT | {"period": "time", "rate": "rate"})
 
     def plot(self, ax: Any = None) -> Any:
         """Draws the portrait.

@@ -116,7 +116,11 @@ class FatalShock(eqx.Module):
             "beyond": self.beyond,
             "status": Status(int(self.status)).name,
         }
-        return table_of([row])
+        quantities = {"x1": "length", "x2": "velocity"}
+        quantities |= {"shock_x1": "length", "shock_x2": "velocity"}
+        # One that combines displacement and velocity has no unit.
+        quantities |= {"distance": "velocity"} if self.direction == "x2" else {}
+        return table_of([row], quantities)
 
     def plot(self, ax: Any = None) -> Any:
         """Draws the shock as an arrow in the portrait.

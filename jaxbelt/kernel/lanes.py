@@ -128,7 +128,7 @@ class Variable:
 
     per_belt: whether it has a number a belt. Of a category, an integer: meanings, what the values
     stand for; or name_of(code, belts), if they are codes that are numbered when all runs are known.
-    dimension: see `own_units.quantity`.
+    dimension: see `dimensions.quantity`; None where there is none, or only its author knows it.
     """
 
     long_name: str
@@ -136,7 +136,7 @@ class Variable:
     per_belt: bool = False
     meanings: Mapping[int, str] | None = None
     name_of: Callable[[int, int], str] | None = None
-    dimension: str = "time"
+    dimension: str | None = None
 
 
 class Observer(eqx.Module):

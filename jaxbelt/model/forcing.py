@@ -13,7 +13,7 @@ clock, and all of this package takes it.
 """
 
 import abc
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
@@ -31,12 +31,13 @@ from ..checks import (
     number,
     require_one_float,
     require_value,
+    scalar,
     traceable,
 )
+from ..dimensions import quantity
 
-
-def _number_named(name: str) -> Callable[[Any], Array]:
-    return lambda value: as_array(value, name)
+#: Dimensions of the fields of waves.
+FORCE, FREQUENCY, ANGLE = map(quantity, ("force", "frequency", "angle"))
 
 
 class _Wave(eqx.Module):
@@ -148,7 +149,7 @@ class ForceInUnits(AbstractForce):
 class ConstantForce(AbstractForce):
     """A constant force, as of an incline: a `Harmonic` with the frequency 0. No clock."""
 
-    amplitude: Float[Array, ""] = eqx.field(converter=_number_named("amplitude"))
+    amplitude: Float[Array, ""] = eqx.field(converter=scalar("amplitude"), metadata=FORCE)
 
     def __init__(self, amplitude: ArrayLike):
         self.amplitude = amplitude  # pyright: ignore[reportAttributeAccessIssue]
@@ -174,9 +175,9 @@ class ConstantForce(AbstractForce):
 class _Sinusoid(AbstractForce):
     """A force of one wave, by its amplitude, frequency and phase."""
 
-    amplitude: Float[Array, ""] = eqx.field(converter=_number_named("amplitude"))
-    frequency: Float[Array, ""] = eqx.field(converter=_number_named("frequency"))
-    phase: Float[Array, ""] = eqx.field(converter=_number_named("phase"), default=0.0)
+    amplitude: Float[Array, ""] = eqx.field(converter=scalar("amplitude"), metadata=FORCE)
+    frequency: Float[Array, ""] = eqx.field(converter=scalar("frequency"), metadata=FREQUENCY)
+    phase: Float[Array, ""] = eqx.field(converter=scalar("phase"), default=0.0, metadata=ANGLE)
 
     def __check_init__(self):
         self.check(type(self).__name__)
@@ -227,6 +228,10 @@ class BaseMotion(_Sinusoid):
         ValueError: If an argument is impossible; the message names it.
     """
 
+    amplitude: Float[Array, ""] = eqx.field(
+        converter=scalar("amplitude"), metadata=quantity("length")
+    )
+
     def bound(self, damping: ArrayLike) -> Array:
         return jnp.abs(self.amplitude) * jnp.sqrt(1 + (damping * self.frequency) ** 2)
 
@@ -256,10 +261,11 @@ class Oscillating(_Wave):
         ValueError: If an argument is impossible; the message names it.
     """
 
-    mean: Float[Array, ""] = eqx.field(converter=_number_named("mean"))
-    amplitude: Float[Array, ""] = eqx.field(converter=_number_named("amplitude"))
-    frequency: Float[Array, ""] = eqx.field(converter=_number_named("frequency"))
-    phase: Float[Array, ""] = eqx.field(converter=_number_named("phase"), default=0.0)
+    # Mean and amplitude have the dimension of what oscillates.
+    mean: Float[Array, ""] = eqx.field(converter=scalar("mean"))
+    amplitude: Float[Array, ""] = eqx.field(converter=scalar("amplitude"))
+    frequency: Float[Array, ""] = eqx.field(converter=scalar("frequency"), metadata=FREQUENCY)
+    phase: Float[Array, ""] = eqx.field(converter=scalar("phase"), default=0.0, metadata=ANGLE)
 
     def __check_init__(self):
         self.check("Oscillating")

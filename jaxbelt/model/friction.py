@@ -12,7 +12,7 @@ import abc
 import itertools
 import operator
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -34,15 +34,12 @@ from ..checks import (
     require,
     require_one_float,
     require_value,
+    scalar,
     traceable,
 )
 
 #: Rounding that mu(0) may have, over 1 + static.
 MU_ROUNDING = 1e-14
-
-
-def _scalar(name: str) -> Callable[[Any], Array]:
-    return lambda value: as_array(value, name)
 
 
 class AbstractFriction(eqx.Module):
@@ -289,10 +286,10 @@ class Conti(AbstractFriction):
         ValueError: If an argument is impossible; the message names it.
     """
 
-    static: Float[Array, ""] = eqx.field(converter=_scalar("static"))
-    residual: Float[Array, ""] = eqx.field(converter=_scalar("residual"))
-    steepness: Float[Array, ""] = eqx.field(converter=_scalar("steepness"))
-    quadratic: Float[Array, ""] = eqx.field(converter=_scalar("quadratic"), default=0.0)
+    static: Float[Array, ""] = eqx.field(converter=scalar("static"))
+    residual: Float[Array, ""] = eqx.field(converter=scalar("residual"))
+    steepness: Float[Array, ""] = eqx.field(converter=scalar("steepness"))
+    quadratic: Float[Array, ""] = eqx.field(converter=scalar("quadratic"), default=0.0)
 
     def __check_init__(self):
         self.check("Conti")
@@ -338,8 +335,8 @@ class Coulomb(AbstractFriction):
         ValueError: If an argument is impossible; the message names it.
     """
 
-    static: Float[Array, ""] = eqx.field(converter=_scalar("static"))
-    kinetic: Float[Array, ""] = eqx.field(converter=_scalar("kinetic"))
+    static: Float[Array, ""] = eqx.field(converter=scalar("static"))
+    kinetic: Float[Array, ""] = eqx.field(converter=scalar("kinetic"))
 
     def __check_init__(self):
         self.check("Coulomb")
@@ -370,9 +367,9 @@ class Stribeck(AbstractFriction):
         ValueError: If an argument is impossible; the message names it.
     """
 
-    static: Float[Array, ""] = eqx.field(converter=_scalar("static"))
-    kinetic: Float[Array, ""] = eqx.field(converter=_scalar("kinetic"))
-    velocity: Float[Array, ""] = eqx.field(converter=_scalar("velocity"))
+    static: Float[Array, ""] = eqx.field(converter=scalar("static"))
+    kinetic: Float[Array, ""] = eqx.field(converter=scalar("kinetic"))
+    velocity: Float[Array, ""] = eqx.field(converter=scalar("velocity"))
 
     def __check_init__(self):
         self.check("Stribeck")
@@ -407,9 +404,9 @@ class Cubic(AbstractFriction):
         ValueError: If an argument is impossible; the message names it.
     """
 
-    a0: Float[Array, ""] = eqx.field(converter=_scalar("a0"))
-    a1: Float[Array, ""] = eqx.field(converter=_scalar("a1"))
-    a3: Float[Array, ""] = eqx.field(converter=_scalar("a3"))
+    a0: Float[Array, ""] = eqx.field(converter=scalar("a0"))
+    a1: Float[Array, ""] = eqx.field(converter=scalar("a1"))
+    a3: Float[Array, ""] = eqx.field(converter=scalar("a3"))
 
     def __init__(self, a0: ArrayLike, a1: ArrayLike, a3: ArrayLike):
         self.a0, self.a1, self.a3 = a0, a1, a3  # pyright: ignore[reportAttributeAccessIssue]

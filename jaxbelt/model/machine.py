@@ -9,7 +9,7 @@ normal force, max N_i / k; velocity, force and energy follow from these. So the 
 """
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import equinox as eqx
@@ -19,7 +19,6 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ..checks import (
-    as_array,
     check_finite,
     check_nonnegative,
     check_positive,
@@ -27,6 +26,7 @@ from ..checks import (
     number,
     require,
     require_value,
+    scalar,
 )
 from ..spelling import refuse_other_names
 from .forcing import AbstractForce, Oscillating, as_forcing, as_velocity, number_or_oscillating
@@ -57,11 +57,11 @@ class Units(eqx.Module):
         ValueError: If a unit is not > 0.
     """
 
-    time: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "time"))
-    length: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "length"))
-    velocity: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "velocity"))
-    force: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "force"))
-    energy: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "energy"))
+    time: Float[Array, ""] = eqx.field(converter=scalar("time"))
+    length: Float[Array, ""] = eqx.field(converter=scalar("length"))
+    velocity: Float[Array, ""] = eqx.field(converter=scalar("velocity"))
+    force: Float[Array, ""] = eqx.field(converter=scalar("force"))
+    energy: Float[Array, ""] = eqx.field(converter=scalar("energy"))
 
     def __check_init__(self):
         for name, value in vars(self).items():
@@ -78,6 +78,18 @@ class Units(eqx.Module):
         return f"Units({', '.join(parts)})"
 
 
+#: Units of dimensions: the symbol, and the value of 1 in it.
+SI_UNITS: dict[str, tuple[str, Callable[[Units], Any]]] = {
+    "time": ("s", lambda units: units.time),
+    "length": ("m", lambda units: units.length),
+    "velocity": ("m s-1", lambda units: units.velocity),
+    "force": ("N", lambda units: units.force),
+    "energy": ("J", lambda units: units.energy),
+    "rate": ("s-1", lambda units: units.rate),
+    "damping": ("N s m-1", lambda units: units.force / units.velocity),
+    "frequency": ("rad s-1", lambda units: units.rate),
+    "angle": ("rad", lambda units: jnp.ones(())),
+}
 #: Other names for the arguments of `PhysicalBelt` and `Machine`.
 OTHER_NAMES = {
     **{"v": "velocity", "speed": "velocity", "law": "friction", "mu": "friction"},
@@ -114,12 +126,8 @@ class PhysicalBelt(eqx.Module):
     normal_force: Any = eqx.field(
         converter=lambda value: number_or_oscillating(value, "normal_force")
     )
-    lower: Float[Array, ""] = eqx.field(
-        converter=lambda value: as_edge(value, "lower"), default=-float("inf")
-    )
-    upper: Float[Array, ""] = eqx.field(
-        converter=lambda value: as_edge(value, "upper"), default=float("inf")
-    )
+    lower: Float[Array, ""] = eqx.field(converter=as_edge("lower"), default=-float("inf"))
+    upper: Float[Array, ""] = eqx.field(converter=as_edge("upper"), default=float("inf"))
 
     def __new__(cls, *_: Any, **given: Any):
         _check_fields(cls, given)
@@ -167,9 +175,9 @@ class Machine(eqx.Module):
         ValueError: If a value is impossible; the message names it.
     """
 
-    mass: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "mass"))
-    stiffness: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "stiffness"))
-    damping: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "damping"))
+    mass: Float[Array, ""] = eqx.field(converter=scalar("mass"))
+    stiffness: Float[Array, ""] = eqx.field(converter=scalar("stiffness"))
+    damping: Float[Array, ""] = eqx.field(converter=scalar("damping"))
     belts: tuple[PhysicalBelt, ...] = eqx.field(
         converter=lambda belts: as_belts(belts, "PhysicalBelt")
     )

@@ -26,7 +26,7 @@ gives that one, and everything that asks for forces, guards or modes at an insta
 
 import functools
 import operator
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import equinox as eqx
@@ -48,7 +48,9 @@ from ..checks import (
     require,
     require_own_threads,
     require_value,
+    scalar,
 )
+from ..dimensions import quantity
 from ..numerics.compiling import traced_once
 from .forcing import AbstractForce, ConstantForce, Oscillating, as_forcing, as_load, as_velocity
 from .friction import AbstractFriction, as_friction
@@ -65,7 +67,12 @@ def _(primals, tangents):
     return edge, jnp.where(jnp.isinf(edge), 0.0, tangent)
 
 
-def as_edge(value: Any, field: str) -> Array:
+def as_edge(field: str) -> Callable[[Any], Array]:
+    """Converter of a field that is the edge of a contact interval."""
+    return lambda value: _as_edge(value, field)
+
+
+def _as_edge(value: Any, field: str) -> Array:
     """`value` as the edge of a contact interval, or a `ValueError`.
 
     An edge at infinity has no effect on the motion, and so no slope: that of inf/L is infinite.
@@ -120,14 +127,14 @@ class Belt(eqx.Module):
     """
 
     # A scalar array, or `Oscillating`.
-    velocity: Any = eqx.field(converter=as_velocity)
+    velocity: Any = eqx.field(converter=as_velocity, metadata=quantity("velocity"))
     friction: AbstractFriction = eqx.field(converter=as_friction)
-    load: Any = eqx.field(converter=as_load, default=1.0)
+    load: Any = eqx.field(converter=as_load, default=1.0, metadata=quantity("force"))
     lower: Float[Array, ""] = eqx.field(
-        converter=lambda value: as_edge(value, "lower"), default=-float("inf")
+        converter=as_edge("lower"), default=-float("inf"), metadata=quantity("length")
     )
     upper: Float[Array, ""] = eqx.field(
-        converter=lambda value: as_edge(value, "upper"), default=float("inf")
+        converter=as_edge("upper"), default=float("inf"), metadata=quantity("length")
     )
 
     def __check_init__(self):
@@ -204,11 +211,9 @@ class Oscillator(eqx.Module):
         ValueError: If a value is impossible; the message names it.
     """
 
-    damping: Float[Array, ""] = eqx.field(converter=lambda value: as_array(value, "damping"))
+    damping: Float[Array, ""] = eqx.field(converter=scalar("damping"), metadata=quantity("damping"))
     belts: tuple[Belt, ...] = eqx.field(converter=as_belts)
-    omega: Float[Array, ""] = eqx.field(
-        converter=lambda value: as_array(value, "omega"), default=1.0
-    )
+    omega: Float[Array, ""] = eqx.field(converter=scalar("omega"), default=1.0)
     forcing: tuple[AbstractForce, ...] = eqx.field(converter=as_forcing, default=())
 
     def __check_init__(self):

@@ -27,6 +27,8 @@ from jax import lax
 from jaxtyping import Array
 
 from ..checks import is_concrete
+from ..dimensions import POWERS
+from ..dimensions import quantity as quantity
 from .forcing import Oscillating
 from .oscillator import Belt, NoEdge, Oscillator, has_edges, scaled_edge
 
@@ -234,18 +236,6 @@ def _unchecked(kind: type, /, **fields: Any) -> Any:
 
 
 # --- results ------------------------------------------------------------------------------------
-
-
-def quantity(*dimensions: str) -> dict[str, tuple[str, ...]]:
-    """The metadata of a field of a result that has a dimension, for `eqx.field`.
-
-    One of `POWERS`; several stand for the columns of an array's last axis.
-    """
-    return {"dimensions": dimensions}
-
-
-#: Dimensions, as powers of the unit of length; time has none.
-POWERS = {"time": 0, "length": 1, "velocity": 1, "energy": 2, "coefficient": -2}
 
 
 def in_given_units(result: Any, osc: Oscillator, own: OwnOscillator) -> Any:

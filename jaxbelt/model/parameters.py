@@ -4,8 +4,12 @@ Two parameters may have one value, and two belts may share one friction law; par
 differ in their place among the leaves of the oscillator, as JAX counts them. So `where` is called
 on a copy of the oscillator whose leaves are unique objects: its result is one of them, or it is not
 a parameter.
+
+The fields of an oscillator state the dimensions of its parameters; the unit of a number of a
+friction law follows from its `in_units_of`.
 """
 
+import re
 from typing import Any, NoReturn
 
 import equinox as eqx
@@ -15,7 +19,12 @@ import numpy as np
 from jaxtyping import Array
 
 from ..checks import is_concrete, require, require_callable
+from .friction import LawInUnits
+from .machine import SI_UNITS, Units
 from .oscillator import Oscillator
+
+#: Relative accuracy to which a number of a friction law has to follow a power of the unit of speed.
+POWER_ROUNDING = 1e-12
 
 
 class Parameter:
@@ -129,3 +138,68 @@ def vary(osc: Oscillator, index: int, p: Array) -> Oscillator:
     # What is known is taken apart in NumPy, which compiles nothing.
     leaves[index] = jnp.asarray(np.asarray(p)[0]) if is_concrete(p) else p[0]
     return jax.tree.unflatten(structure, leaves)
+
+
+# --- units ----------------------------------------------------------------------------------------
+
+
+def unit_of(name: str, osc: Oscillator, units: Units) -> tuple[str, float]:
+    """Unit of a parameter of an oscillator, and the value of 1 in it.
+
+    Tied parameters, "damping = belts[0].load", must have the same. "" and 1 where only the author
+    of a force or a law knows it.
+    """
+    found = set()
+    for path in name.split(" = "):
+        if ".friction." in path:
+            found.add(_unit_in_law(path, osc, units))
+        elif dimension := _dimension_of(path, osc):
+            symbol, size = SI_UNITS[dimension]
+            found.add((symbol, float(size(units))))
+        else:
+            found.add(("", 1.0))
+    require(len(found) == 1, "result", "of tied parameters with one unit", name)
+    return found.pop()
+
+
+def _dimension_of(path: str, osc: Oscillator) -> str | None:
+    """Dimension of a number, of its field or of the field that holds it; None: not stated."""
+    owner: Any = osc
+    dimension = None
+    for step in re.findall(r"\w+", path):
+        if step.isdecimal():
+            owner = owner[int(step)]
+            continue
+        stated = type(owner).__dataclass_fields__[step].metadata.get("dimensions")
+        (dimension,) = stated or (dimension,)
+        owner = getattr(owner, step)
+    return dimension
+
+
+def _unit_in_law(path: str, osc: Oscillator, units: Units) -> tuple[str, float]:
+    """Unit of a number of a friction law, and the value of 1 in it.
+
+    It follows from how the number changes when speeds are given in another unit; "" and 1 where the
+    law takes speeds in a unit that only its author knows.
+    """
+    number = names_of(osc).index(path)
+    leaves, structure = jax.tree.flatten(osc)
+    if not np.any(leaves[number]):
+        leaves[number] = jnp.ones(())
+        osc = jax.tree.unflatten(structure, leaves)
+    index = int(path.removeprefix("belts[").partition("]")[0])
+    law = osc.belts[index].friction
+    halved = law.in_units_of(jnp.asarray(2.0))
+    if isinstance(law, LawInUnits) or type(halved) is not type(law):
+        return "", 1.0
+    scaled = eqx.tree_at(lambda o: o.belts[index].friction, osc, halved)
+    ratio = float(jax.tree.leaves(scaled)[number] / leaves[number])
+    power = round(np.log2(ratio)) if ratio > 0 else 0
+    is_power = abs(ratio / 2.0**power - 1) < POWER_ROUNDING
+    require(is_power, "result", "of what goes with a power of the speed in in_units_of", path)
+    symbol = " ".join(
+        unit + (str(n) if n != 1 else "")
+        for n, unit in sorted(((power, "s"), (-power, "m")), reverse=True)
+        if n
+    )
+    return symbol or "1", float(units.velocity) ** -power

@@ -21,7 +21,7 @@ from ..checks import require
 from ..cycles.cycle import Cycle
 from ..cycles.functionals import amplitude, period
 from ..spelling import did_you_mean
-from .style import figure_of, make_room, new_axes, parameter_label, spread
+from .style import COORDINATES, figure_of, make_room, new_axes, parameter_label, spread
 
 UNSTABLE_COLOUR = "0.6"
 
@@ -32,8 +32,7 @@ UNSTABLE_COLOUR = "0.6"
 #: Quantities that have a name, and the labels of their axes.
 QUANTITIES = {
     "amplitude": "amplitude of $x_1$",
-    "x1": "displacement $x_1$",
-    "x2": "velocity $x_2$",
+    **COORDINATES,
     "period": "period $T$",
 }
 Quantity = str | Callable[[Cycle], Any]

@@ -37,17 +37,12 @@ from .regions import plot_region_map
 from .style import add_key, figure_of, require_axes
 from .sweeps import plot_basins, plot_blocks, plot_explanation, plot_fractions, plot_stability
 
-
-def _plot_curve(curve: BifurcationCurve, ax: Axes | None = None) -> Axes:
-    return plot_curves([curve], ax)
-
-
 PICTURES: dict[type, Callable[..., Axes]] = {
     Arcs: plot_arcs,
     BasinFractions: plot_fractions,
     Basins: plot_basins,
     BasinStability: plot_stability,
-    BifurcationCurve: _plot_curve,
+    BifurcationCurve: lambda curve, ax=None: plot_curves([curve], ax),
     BifurcationDiagram: plot_diagram,
     BifurcationPoint: plot_point,
     CircleMap: plot_circle_map,

@@ -13,7 +13,7 @@ from ..model.oscillator import at_time
 from ..results import Status
 from ..sweeps.circle_map import CircleMap
 from ..tables import require_single
-from .style import BELT_COLOURS, new_axes
+from .style import belt_colour, label_plane, new_axes
 
 #: Points of a curve, for each period of the forcing.
 SAMPLES_OF_PERIOD = 257
@@ -22,25 +22,27 @@ SAMPLES_OF_PERIOD = 257
 STEEPEST = 2.5
 
 
+def check_found(result: Any, name: str) -> None:
+    """Raises a `ValueError` unless the status of a result is OK."""
+    status = Status(int(result.status))
+    require(status == Status.OK, name, "one with status OK, to be drawn", status.name)
+
+
 def plot_motion(motion: PeriodicMotion, ax: Axes | None = None) -> Axes:
     """Draws a periodic motion in the phase plane, dashed where it is unstable, with a dot at the
     phase 0 of each period, and the velocities of belts that run steadily."""
     require_single(motion, motion.residual, 0)
-    status = Status(int(motion.status))
-    require(status == Status.OK, "motion", "one with status OK, to be drawn", status.name)
+    check_found(motion, "motion")
     ax = new_axes() if ax is None else ax
     states = np.asarray(motion.sample(SAMPLES_OF_PERIOD * motion.periods))
-    style = "-" if bool(motion.stable) else "--"
-    ax.plot(*states.T, color="black", linestyle=style, linewidth=1.2)
+    ax.plot(*states.T, color="black", linestyle="-" if motion.stable else "--", linewidth=1.2)
     ax.plot(*np.asarray(motion.starts).T, "o", color="black", markersize=4, label="phase 0")
     osc = motion.oscillator
     for number, belt in enumerate(at_time(osc, jnp.zeros(())).belts):
         if type(belt).__name__ == "Belt":
-            velocity = float(belt.velocity) / float(osc.omega)
-            colour = BELT_COLOURS[number % len(BELT_COLOURS)]
-            ax.axhline(velocity, color=colour, linewidth=0.8, label=f"belt {number}")
-    ax.set_xlabel("displacement $x_1$")
-    ax.set_ylabel("velocity $x_2$")
+            style = {"color": belt_colour(number), "linewidth": 0.8, "label": f"belt {number}"}
+            ax.axhline(float(belt.velocity) / float(osc.omega), **style)
+    label_plane(ax)
     ax.legend(fontsize="small")
     return ax
 

@@ -8,7 +8,7 @@ from ..motion.simulate import Arcs, Events, Trajectory
 from ..results import EventKind
 from ..tables import require_single
 from .phase import belt_shading, path_of, stick_phases
-from .style import belt_colour, new_axes
+from .style import COORDINATES, TIME, belt_colour, new_axes
 
 #: Marks of events, and their names.
 EVENT_MARKS = {
@@ -31,14 +31,13 @@ def plot_trajectory(trajectory: Trajectory, ax: Axes | None = None) -> Axes:
     require_single(trajectory, trajectory.ts, 1)
     ax = new_axes() if ax is None else ax
     t, ys = path_of(trajectory)
-    ax.plot(t, ys[:, 0], color="black", linewidth=1.1, label="displacement $x_1$")
-    ax.plot(t, ys[:, 1], color="0.35", linewidth=0.9, linestyle="--", label="velocity $x_2$")
+    ax.plot(t, ys[:, 0], color="black", linewidth=1.1, label=COORDINATES["x1"])
+    ax.plot(t, ys[:, 1], color="0.35", linewidth=0.9, linestyle="--", label=COORDINATES["x2"])
     # sorted, so that the key has the belts in order
     for belt, begin, end in sorted(stick_phases(trajectory)):
         ax.axvspan(begin, end, label=f"sticks to belt {belt}", zorder=0, **belt_shading(belt))
     ax.margins(x=0)
-    ax.set_xlabel(r"time $\tau$")
-    ax.set_ylabel("displacement $x_1$, velocity $x_2$")
+    ax.set(xlabel=TIME, ylabel=", ".join(COORDINATES.values()))
     return ax
 
 
@@ -54,7 +53,7 @@ def plot_events(events: Events, ax: Axes | None = None) -> Axes:
         ax.plot(t, np.full(len(t), height), marker=marker, **style)
     names = [EVENT_MARKS[kind][1].format(belt) for belt, kind in lines]
     ax.set_yticks(range(len(lines)), names)
-    ax.set(xlabel=r"time $\tau$", ylabel="event", ylim=(-0.6, len(lines) - 0.4))
+    ax.set(xlabel=TIME, ylabel="event", ylim=(-0.6, len(lines) - 0.4))
     return ax
 
 
@@ -76,7 +75,7 @@ def plot_arcs(arcs: Arcs, ax: Axes | None = None) -> Axes:
                 style = {"facecolor": colour, "hatch": hatch, "edgecolor": "0.6", "linewidth": 0.0}
                 ax.broken_barh(bars.tolist(), (belt - 0.35, 0.7), label=words, **style)
     ax.set_yticks(range(len(belts)), [f"belt {belt}" for belt in range(len(belts))])
-    ax.set(xlabel=r"time $\tau$", ylabel="contact", ylim=(-0.6, len(belts) - 0.4))
+    ax.set(xlabel=TIME, ylabel="contact", ylim=(-0.6, len(belts) - 0.4))
     ax.xaxis.set_major_locator(MaxNLocator(8))
     ax.margins(x=0)
     return ax

@@ -9,8 +9,7 @@ from matplotlib.lines import Line2D
 from ..checks import require_one_of, require_value
 from ..sweeps.moments import AtExtrema
 from ..sweeps.orbit_diagram import NOT_PERIODIC, OrbitDiagram
-from .diagrams import QUANTITIES
-from .style import add_key, figure_of, new_axes, parameter_label
+from .style import COORDINATES, add_key, figure_of, new_axes, parameter_label
 
 #: Marks of each kind of attractor (Okabe and Ito), and its name in the key. Undecided starts have
 #: no place; ticks at the lower edge show their parameters.
@@ -44,7 +43,7 @@ def plot_orbits(
     """Draws the points of an orbit diagram over its parameter; see `OrbitDiagram.plot`."""
     if quantity is None:
         quantity = diagram.at.of if isinstance(diagram.at, AtExtrema) else "x1"
-    require_one_of(quantity, ("x1", "x2"), "quantity")
+    require_one_of(quantity, COORDINATES, "quantity")
     require_value(isinstance(zoom, bool), "zoom", "True or False", zoom)
     ax = new_axes() if ax is None else ax
     lines = _lines(ax, diagram)
@@ -53,7 +52,7 @@ def plot_orbits(
         ax.update_datalim(one.line.get_xydata(), updatey=one.kind != "undecided")
     ax.autoscale_view()
     ax.set_xlim(diagram.values[0], diagram.values[-1])
-    ax.set(xlabel=parameter_label(diagram.name), ylabel=QUANTITIES[quantity])
+    ax.set(xlabel=parameter_label(diagram.name), ylabel=COORDINATES[quantity])
     if zoom:
         _Zoom(diagram, ax, lines, quantity)
     return ax

@@ -42,12 +42,15 @@ from ..model.transitions import mode_of_state
 from ..motion.simulate import Trajectory
 from ..numerics.compiling import jit
 from .style import (
+    COORDINATES,
+    TIME,
     add_key,
     belt_colour,
     figure_of,
     journal_figure,
     key_columns,
     key_entries,
+    label_plane,
     new_axes,
     new_figure,
     require_axes,
@@ -108,15 +111,15 @@ def plot_time_history(trajectory: Trajectory, ax: Sequence[Axes] | None = None) 
         ax = tuple(new_figure().subplots(2, sharex=True))
     t, ys = path_of(trajectory)
     upper, lower = ax
-    for axes, component, name in ((upper, 0, "displacement $x_1$"), (lower, 1, "velocity $x_2$")):
-        axes.plot(t, ys[:, component], color="black", linewidth=0.9)
+    for axes, values, name in zip(ax, ys.T, COORDINATES.values(), strict=True):
+        axes.plot(t, values, color="black", linewidth=0.9)
         axes.set_ylabel(name)
         axes.margins(x=0)
     for belt, begin, end in stick_phases(trajectory):
         for axes in ax:
             axes.axvspan(begin, end, label=f"sticks to belt {belt}", zorder=0, **belt_shading(belt))
     upper.tick_params(labelbottom=False)
-    lower.set_xlabel(r"time $\tau$")
+    lower.set_xlabel(TIME)
     figure_of(lower).align_ylabels(ax)
     entries = key_entries([upper])
     if entries:
@@ -256,8 +259,7 @@ def plot_phase_portrait(
         _draw_arrowheads(ax, loop, "black", _lowest(loop))
     for equilibrium in rests:
         draw_equilibrium(ax, equilibrium)
-    ax.set_xlabel("displacement $x_1$")
-    ax.set_ylabel("velocity $x_2$")
+    label_plane(ax)
     if is_new:
         add_key(ax)
     return ax
@@ -299,8 +301,7 @@ def plot_separatrix(separatrix: Separatrix, ax: Axes | None = None) -> Axes:
     words = "its end" if separatrix.stable else "its beginning"
     dot = {"marker": "o", "markersize": 5, "color": "black", "linestyle": "none", "zorder": 5}
     ax.plot(*np.asarray(separatrix.point)[:, None], label=words, **dot)
-    ax.set_xlabel("displacement $x_1$")
-    ax.set_ylabel("velocity $x_2$")
+    label_plane(ax)
     return ax
 
 
@@ -564,8 +565,7 @@ def plot_vector_field(
             color="0.6", pivot="mid", scale=28, width=0.003, headwidth=4, zorder=1,
         )  # fmt: skip
     plot_boundaries(osc, ax)
-    ax.set_xlabel("displacement $x_1$")
-    ax.set_ylabel("velocity $x_2$")
+    label_plane(ax)
     return ax
 
 
@@ -590,7 +590,7 @@ def draw_overview(
     plane = figure.add_subplot(grid[:, 1])
     if has_clock(osc):
         plane.plot(*path_of(trajectory)[1].T, color=ORBIT_COLOUR, linewidth=0.7)
-        plane.set(xlabel="displacement $x_1$", ylabel="velocity $x_2$")
+        label_plane(plane)
     else:
         plot_phase_portrait(osc, trajectory, cycles=cycles, ax=plane)
     return figure

@@ -4,7 +4,6 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from ..bifurcations.base import BifurcationPoint
-from ..checks import require
 from ..cycles.cycle import Cycle
 from ..cycles.periodic import PeriodicMotion
 from ..cycles.shocks import FatalShock
@@ -12,9 +11,9 @@ from ..inverse.design import Design
 from ..model.equilibria import Equilibria
 from ..results import Status
 from ..tables import require_single
-from .forced import plot_motion
+from .forced import check_found, plot_motion
 from .phase import draw_equilibrium, draw_orbit, plot_phase_portrait, plot_portrait
-from .style import BELT_COLOURS, new_axes
+from .style import BELT_COLOURS, label_plane, new_axes
 
 #: Colour of the arrow of a shock: that of a fourth belt, which no class has.
 SHOCK = BELT_COLOURS[3]
@@ -23,13 +22,8 @@ SHOCK = BELT_COLOURS[3]
 def plot_cycle(cycle: Cycle, ax: Axes | None = None) -> Axes:
     """Draws a cycle with the boundaries and equilibria of its oscillator."""
     require_single(cycle, cycle.period, 0)
-    _check_found(cycle, "cycle")
+    check_found(cycle, "cycle")
     return plot_phase_portrait(cycle.oscillator, cycles=[cycle], ax=ax)
-
-
-def _check_found(result: Cycle | BifurcationPoint, name: str) -> None:
-    status = Status(int(result.status))
-    require(status == Status.OK, name, "one with status OK, to be drawn", status.name)
 
 
 def plot_design(design: Design, ax: Axes | None = None) -> Axes:
@@ -42,16 +36,14 @@ def plot_design(design: Design, ax: Axes | None = None) -> Axes:
 def plot_point(point: BifurcationPoint, ax: Axes | None = None) -> Axes:
     """Draws the phase plane at a bifurcation point, with the cycle where there is one."""
     require_single(point, point.value, 0)
-    _check_found(point, "point")
+    check_found(point, "point")
     if isinstance(point.cycle, PeriodicMotion):
         drawn = plot_motion(point.cycle, ax)
-        drawn.set_title(f"{point.condition.words} at {float(point.value):.6g}", fontsize="medium")
-        return drawn
-    cycles = [point.cycle] if int(point.cycle.status) == Status.OK else []
-    drawn: Axes = plot_phase_portrait(point.oscillator, cycles=cycles, ax=ax)
-    orbit = point.orbit
-    if orbit is not None and not cycles:
-        draw_orbit(drawn, orbit, point.condition.line.name or point.kind)
+    else:
+        cycles = [point.cycle] if int(point.cycle.status) == Status.OK else []
+        drawn: Axes = plot_phase_portrait(point.oscillator, cycles=cycles, ax=ax)
+        if (orbit := point.orbit) is not None and not cycles:
+            draw_orbit(drawn, orbit, point.condition.line.name or point.kind)
     drawn.set_title(f"{point.condition.words} at {float(point.value):.6g}", fontsize="medium")
     return drawn
 
@@ -82,6 +74,5 @@ def plot_equilibria(equilibria: Equilibria, ax: Axes | None = None) -> Axes:
         left, right = float(table.x1_lower.min()), float(table.x1_upper.max())
         margin = 0.2 * (right - left) or 0.5
         ax.set(xlim=(left - margin, right + margin), ylim=(-1.0, 1.0))
-    ax.set_xlabel("displacement $x_1$")
-    ax.set_ylabel("velocity $x_2$")
+    label_plane(ax)
     return ax

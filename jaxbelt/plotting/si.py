@@ -20,18 +20,20 @@ from ..bifurcations.base import BifurcationPoint
 from ..bifurcations.diagrams import BifurcationDiagram
 from ..checks import require
 from ..cycles.functionals import MEASURED_IN
-from ..model.machine import Units
-from ..si import SYMBOLS, AlongParameter, check_machine, rest_in_m, units_along, units_of
+from ..model.machine import SI_UNITS, Units
+from ..si import AlongParameter, check_machine, units_along, units_of
+from ..sweeps.naming import rest_in_m
+from .diagrams import QUANTITIES
 from .draw import draw_result
-from .style import figure_of, in_fractions, parameter_label, require_axes
+from .style import TIME, figure_of, in_fractions, parameter_label, require_axes
 
 #: For each label of an axis: its quantity, and its label in SI units.
 LABELS = {
-    r"time $\tau$": ("time", "time $t$ (s)"),
-    "period $T$": ("time", "period (s)"),
-    "displacement $x_1$": ("length", "displacement $X$ (m)"),
-    "amplitude of $x_1$": ("length", "amplitude of $X$ (m)"),
-    "velocity $x_2$": ("velocity", r"velocity $\dot X$ (m/s)"),
+    TIME: ("time", "time $t$ (s)"),
+    QUANTITIES["period"]: ("time", "period (s)"),
+    QUANTITIES["x1"]: ("length", "displacement $X$ (m)"),
+    QUANTITIES["amplitude"]: ("length", "amplitude of $X$ (m)"),
+    QUANTITIES["x2"]: ("velocity", r"velocity $\dot X$ (m/s)"),
     r"relative velocity $\nu_{\mathrm{R}}$": ("velocity", r"relative velocity $R$ (m/s)"),
 }
 #: Labels in SI units of parameters of an oscillator, by the end of their path.
@@ -137,11 +139,11 @@ def _units_of_picture(result: Any, machine: Any) -> tuple[Units, tuple[float, st
 
 def _relabel_key(ax: Axes, units: Units) -> None:
     for artist in ax.get_children():
-        if (words := rest_in_m(label := str(artist.get_label()), units)) != label:
+        if (words := rest_in_m(label := str(artist.get_label()), units.length)) != label:
             artist.set_label(words)
     for key in [ax.get_legend(), *figure_of(ax).legends]:
         for text in key.get_texts() if key else ():
-            words = rest_in_m(text.get_text(), units)
+            words = rest_in_m(text.get_text(), units.length)
             text.set_text(words.replace("$x_1$", "$X$").replace("$x_2$", r"$\dot X$"))
 
 
@@ -193,8 +195,8 @@ def _convert_functional(
     elif (quantity := known[0]) != "number":
         if quantity == "coordinate":
             quantity = {"x1": "length", "x2": "velocity"}[coordinate]
-        unit, symbol = float(getattr(units, quantity)), in_fractions(SYMBOLS[quantity])
-        _scale(ax, 1, unit, f"{name} ({symbol})", before)
+        symbol, size = SI_UNITS[quantity]
+        _scale(ax, 1, float(size(units)), f"{name} ({in_fractions(symbol)})", before)
 
 
 def _put_velocity_aside(ax: Axes, unit: float, label: str, before: _Before | None) -> None:

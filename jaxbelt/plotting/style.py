@@ -38,6 +38,15 @@ KEY_ORDER = (
     "saddle",
 )
 
+#: Labels of the axes of time and of the coordinates.
+TIME = r"time $\tau$"
+COORDINATES = {"x1": "displacement $x_1$", "x2": "velocity $x_2$"}
+#: What all keys look like.
+KEY: dict[str, Any] = {
+    "handler_map": {tuple: HandlerTuple(ndivide=None, pad=0.0)},
+    "frameon": False,
+    "columnspacing": 1.4,
+}
 #: Names and symbols of parameters, by the end of their path in the oscillator, or by the name of a
 #: function's argument without its number; % is the number of the belt.
 PARAMETERS = {
@@ -121,14 +130,12 @@ def draw_key(figure: Figure, note: str = "", *, leave_out: Axes | None = None) -
     figure.legend(
         entries.values(),
         entries.keys(),
-        handler_map={tuple: HandlerTuple(ndivide=None, pad=0.0)},
         loc="outside lower center",
         ncols=key_columns(72 * figure.get_size_inches()[0], list(entries)),
-        frameon=False,
         handlelength=1.8,
-        columnspacing=1.4,
         title=note or None,
         title_fontsize="small",
+        **KEY,
     )
 
 
@@ -156,15 +163,13 @@ def add_key(ax: Axes) -> None:
     ax.legend(
         entries.values(),
         entries.keys(),
-        handler_map={tuple: HandlerTuple(ndivide=None, pad=0.0)},
         loc="upper center",
         bbox_to_anchor=(0.5, 0.0),
         bbox_transform=ax.transAxes + below,
         borderaxespad=0.0,
         ncols=key_columns(width, list(entries), room),
-        frameon=False,
         handlelength=2.2,
-        columnspacing=1.4,
+        **KEY,
     )
 
 
@@ -184,6 +189,11 @@ def key_columns(width: float, labels: Sequence[str], room: float = 0.0) -> int:
         return 2 if halves + 8.0 * size < room else 1
     rows = -(-len(labels) // count)
     return -(-len(labels) // rows)
+
+
+def label_plane(ax: Axes) -> None:
+    """Labels the axes of the phase plane."""
+    ax.set(xlabel=COORDINATES["x1"], ylabel=COORDINATES["x2"])
 
 
 def parameter_label(name: str) -> str:

@@ -8,7 +8,6 @@ import matplotlib.colors
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
@@ -28,7 +27,7 @@ from .style import (
     belt_colour,
     figure_of,
     in_fractions,
-    journal_figure,
+    label_plane,
     new_axes,
     parameter_label,
     require_axes,
@@ -193,10 +192,10 @@ def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:
     palette = matplotlib.colors.ListedColormap(["white", *colours])
     mesh = ax.pcolormesh(x1, x2, labels.T, cmap=palette, vmin=-1.5, vmax=len(colours) - 0.5)
     mesh.set_rasterized(True)
-    ax.set(xlim=(x1[0], x1[-1]), ylim=(x2[0], x2[-1]))
+    limits: dict[str, Any] = dict(xlim=(x1[0], x1[-1]), ylim=(x2[0], x2[-1]))
+    ax.set(**limits)
     for colour, name in zip(colours, basins.attractors, strict=True):
         ax.add_patch(Rectangle((0, 0), 0, 0, facecolor=colour, edgecolor="0.4", label=f"to {name}"))
-    limits: dict[str, Any] = dict(xlim=(x1[0], x1[-1]), ylim=(x2[0], x2[-1]))
     cycles = [c for c in (*basins.cycles, basins.boundary) if c is not None and int(c.status) == 0]
     if basins.boundary is None:
         motions = [one for one in cycles if isinstance(one, PeriodicMotion)]
@@ -204,7 +203,8 @@ def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:
             style: dict[str, Any] = {"marker": mark, "mec": "black", "mfc": "white", "ls": "none"}
             states = np.asarray(motion.starts)
             ax.plot(*states.T, **style, label=f"{len(states)}-periodic")
-        ax.set(xlabel="displacement $x_1$", ylabel="velocity $x_2$", **limits)
+        label_plane(ax)
+        ax.set(**limits)
     else:
         plot_phase_portrait(basins.oscillator, cycles=cycles, **limits, ax=ax)
     add_key(ax)
@@ -218,13 +218,6 @@ def _basin_colours(attractors: Sequence[str]) -> list[str]:
         iter(["#F6C98F", "#F3DCE8", "#F5E9A9", "#E3A56B", "#DDB5CB"]),
     )
     return [next(cycles if is_cycle(name) else others, "#DDDDDD") for name in attractors]
-
-
-def draw_basins(basins: Basins) -> Figure:
-    """Basins of attraction on a page, with a key."""
-    figure = journal_figure(4.6, 4.4)
-    plot_basins(basins, ax=figure.subplots())
-    return figure
 
 
 def plot_stability(stability: BasinStability, ax: Axes | None = None) -> Axes:

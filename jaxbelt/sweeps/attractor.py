@@ -104,13 +104,15 @@ class Attractor(Observer):
         "kind": Variable("what the run leads to", "int8", meanings=dict(enumerate(KINDS))),
         "signature": Variable("events of one loop of the cycle", "int64", name_of=signature),
         "sticks": Variable("whether the attractor sticks to the belt", "bool", per_belt=True),
-        "period": Variable("period of the cycle"),
-        "stick_duration": Variable("time stuck to the belt in one loop", per_belt=True),
+        "period": Variable("period of the cycle", dimension="time"),
+        "stick_duration": Variable(
+            "time stuck to the belt in one loop", per_belt=True, dimension="time"
+        ),
         "x1_min": Variable("smallest displacement on the attractor", dimension="length"),
         "x1_max": Variable("largest displacement on the attractor", dimension="length"),
         "x2_min": Variable("smallest velocity on the attractor", dimension="velocity"),
         "x2_max": Variable("largest velocity on the attractor", dimension="velocity"),
-        "transient": Variable("time at which the attractor was reached"),
+        "transient": Variable("time at which the attractor was reached", dimension="time"),
         "n_events": Variable("number of events (of a cycle: in one loop)", "int32"),
     }
     #: Distance to the last state at the end of a stick phase, over the amplitude, up to which both

@@ -18,6 +18,8 @@ from .queue import by_name, layout
 if TYPE_CHECKING:
     import xarray
 
+#: Dimensions of the axes of starts.
+DIMENSIONS_OF_STARTS = {"x1": "length", "x2": "velocity"}
 #: Words for axes; other arguments of `make` go by their own name.
 AXIS_NAMES = {
     "nu0": "velocity of belt 0",
@@ -82,6 +84,26 @@ def words_of(values: np.ndarray, attributes: dict[str, Any]) -> np.ndarray:
     return np.asarray(words[np.where(numbers[place] == values, place + 1, 0)])
 
 
+def variable_of(
+    name: str, described: Mapping[str, Variable], derivatives: Iterable[str]
+) -> Variable:
+    """Description of a variable that an observer describes, of a derivative of one, or of neither.
+
+    The dimension of a derivative is "velocity / length", say, or "length / unit of nu0".
+    """
+    if name in described:
+        return described[name]
+    for by in derivatives:
+        of = name.removeprefix("d_").removesuffix(f"_d_{by}")
+        if name == f"d_{of}_d_{by}":
+            known = described.get(of, Variable(of))
+            per = DIMENSIONS_OF_STARTS.get(by, f"unit of {by}")
+            dimension = f"{known.dimension} / {per}" if known.dimension else None
+            words = f"derivative of {of} by {by}"
+            return Variable(words, per_belt=known.per_belt, dimension=dimension)
+    return Variable(name)
+
+
 def flags(meanings: Mapping[int, str], dtype: str) -> dict[str, Any]:
     """CF's attributes of a category."""
     return {
@@ -133,14 +155,7 @@ class Table:
 
     def variable(self, name: str) -> Variable:
         """Description of a variable."""
-        if name in self.described:
-            return self.described[name]
-        for by in self.derivatives:
-            of = name.removeprefix("d_").removesuffix(f"_d_{by}")
-            if name == f"d_{of}_d_{by}":
-                known = self.described.get(of, Variable(of))
-                return Variable(f"derivative of {of} by {by}", per_belt=known.per_belt)
-        return Variable(name)
+        return variable_of(name, self.described, self.derivatives)
 
     def empty(self, name: str) -> Any:
         """Placeholder for results that are not there yet."""
@@ -178,6 +193,8 @@ class Table:
         """Attributes of a variable, without the flags of categories that are numbered."""
         variable = self.variable(name)
         attributes: dict[str, Any] = {"long_name": variable.long_name}
+        if variable.dimension:
+            attributes["quantity"] = variable.dimension
         if variable.meanings:
             meanings = {_not_done(variable.meanings): NOT_DONE, **variable.meanings}
             attributes |= flags(meanings, variable.dtype)
@@ -188,10 +205,10 @@ class Table:
         axes = dict(self.grid.axes)
         if any("belt" in self.dims(name) for name in self.shapes):
             axes["belt"] = np.arange(len(self.grid.example.belts))
-        return {
-            name: (name, values, {"long_name": AXIS_NAMES.get(name, name)})
-            for name, values in axes.items()
-        }
+        told = {name: {"long_name": AXIS_NAMES.get(name, name)} for name in axes}
+        for name in DIMENSIONS_OF_STARTS.keys() & axes.keys():
+            told[name]["quantity"] = DIMENSIONS_OF_STARTS[name]
+        return {name: (name, values, told[name]) for name, values in axes.items()}
 
     def numbered(self) -> list[str]:
         """Variables whose categories are numbered when all runs are known."""

@@ -22,6 +22,7 @@ from ..activity import announced, note_progress
 from ..checks import as_positive, as_whole, outside_of_traces
 from ..cycles.attractors import MAYBE_SAME, Runs, distance, error_of_runs, place_of
 from ..cycles.cycle import cycle_from
+from ..dimensions import EXTENT
 from ..model.equilibria import equilibria
 from ..model.oscillator import Oscillator, refuse_clock
 from ..model.own_units import quantity, rescaled
@@ -50,8 +51,9 @@ ATTRACTS = 1e-9
 MOST_CYCLES = 50
 #: Smallest part of a step along the parameter in which an attractor is followed that moves too far.
 SMALLEST_PART = 1 / 64
-#: Where an attractor is: its smallest and largest x1 and x2; and the period of a loop.
-PLACE = ("x1_min", "x1_max", "x2_min", "x2_max", "period")
+#: Where an attractor is: its smallest and largest x1 and x2; and the period of a loop. With the
+#: dimensions.
+PLACE = EXTENT | {"period": "time"}
 
 
 class BasinFractions(eqx.Module):
@@ -115,7 +117,8 @@ class BasinFractions(eqx.Module):
                     column: np.column_stack([getattr(self, column), nothing])[rows, which]
                     for column in PLACE
                 },
-            }
+            },
+            PLACE,
         )
 
     def plot(self, ax: Any = None) -> Any:

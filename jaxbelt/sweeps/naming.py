@@ -1,14 +1,18 @@
 """Attractors that runs lead to, and the words for them."""
 
 import math
+import re
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..cycles.attractors import is_same
 from ..cycles.cycle import Cycle
 from ..cycles.periodic import PeriodicMotion, is_same_motion
+
+#: Where the mass rests, at the end of the words for an attractor.
+REST = re.compile(r"(?<=rest.at.)-?\d+(\.\d+)?(e[+-]\d+)?$")
 
 
 class Found(NamedTuple):
@@ -62,6 +66,16 @@ def words_for(kind: str, sticks: np.ndarray, x1: float, length: float) -> str:
         return f"{kind} motion"
     moves = "cycle" if kind == "cycle" else f"{kind} motion"
     return f"{moves} that sticks to {belts}" if belts else f"{moves} that never sticks"
+
+
+def rest_in_m(words: str, length: Any) -> str:
+    """The words with the place of rest in m, to the digits that are known; length: of 1, in m."""
+
+    def in_m(found: re.Match) -> str:
+        digits = len(found[0].partition("e")[0].replace(".", "").lstrip("-0"))
+        return f"{float(found[0]) * float(length):.{max(1, digits)}g} m"
+
+    return REST.sub(in_m, words)
 
 
 def is_cycle(name: str) -> bool:

@@ -135,7 +135,8 @@ class OrbitDiagram(eqx.Module):
                 "period": self.period[rows, starts],
                 "x1": self.x1[held],
                 "x2": self.x2[held],
-            }
+            },
+            {"period": "time", "x1": "length", "x2": "velocity"},
         )
 
     def plot(self, ax: Any = None, *, quantity: str | None = None, zoom: bool = False) -> Any:

@@ -8,7 +8,7 @@ import itertools
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -30,12 +30,15 @@ from ..model.oscillator import has_clock
 from ..spelling import did_you_mean
 from .along import Along
 from .attractor import Attractor
-from .datasets import Table
+from .datasets import DIMENSIONS_OF_STARTS, Table, variable_of
 from .grid import Grid
 from .moments import AtEvents, checked
 from .observers import Final, Reduce
 from .reducers import check_reducer
 from .strobes import ForcedAttractor, LargestExponent
+
+if TYPE_CHECKING:
+    import xarray
 
 #: Default t1 of attractor runs: some 500 loops; nearly all runs are decided long before.
 LONG_ENOUGH = 30_000.0
@@ -189,6 +192,24 @@ class Question:
             identity["observe"] = f"{kind} {fingerprint(self.observe, 'observe')}"
         identity["derivatives"] = repr(self.derivatives)
         return identity
+
+
+def quantities_of(dataset: "xarray.Dataset") -> dict[str, str]:
+    """Dimensions of the variables and coordinates of a dataset: their attributes `quantity`.
+
+    In stores of earlier versions none has it; there the observers describe the variables.
+    """
+    named = dataset.variables.items()
+    stated = {str(name): one.attrs["quantity"] for name, one in named if "quantity" in one.attrs}
+    if stated or dataset.attrs.get("observe", "final") not in NAMED_FORCED:
+        return stated
+    observers = (*NAMED.values(), *NAMED_FORCED.values())
+    described = {name: one for kind in observers for name, one in kind.variables.items()}
+    axes = [str(name) for name in dataset.coords]
+    found = {name: DIMENSIONS_OF_STARTS.get(name) for name in axes}
+    for name in map(str, dataset.data_vars):
+        found[name] = variable_of(name, described, axes).dimension
+    return {name: dimension for name, dimension in found.items() if dimension}
 
 
 def settings_of_runs(t1: Any, rtol: Any, atol: Any) -> dict[str, Any]:

@@ -132,7 +132,7 @@ def _handed_in(observer: Observer, osc: OwnOscillator, lanes: Lanes) -> dict[str
     found = observer.finish(osc, lanes)
     for name, value in found.items():
         known = observer.variables.get(name)
-        if known is not None and known.dimension != "time":
+        if known is not None and known.dimension:
             found[name] = jax.tree.map(lambda x, to=known.dimension: osc.units.back(x, to), value)
     return found
 

@@ -196,8 +196,8 @@ class LargestExponent(Observer):
     """The largest Lyapunov exponent of a forced run, over its last three quarters."""
 
     variables: ClassVar[Mapping[str, Variable]] = {
-        "exponent": Variable("largest Lyapunov exponent per unit of time"),
-        "exponent_error": Variable("its standard error"),
+        "exponent": Variable("largest Lyapunov exponent per unit of time", dimension="rate"),
+        "exponent_error": Variable("its standard error", dimension="rate"),
         "n_events": Variable("number of events", "int32"),
     }
 
@@ -245,9 +245,11 @@ class ForcedAttractor(Observer):
         **{name: Attractor.variables[name] for name in OF_LOOPS_AND_MOTIONS},
         "x1_strobe": Variable("displacement at the strobe where it is largest", dimension="length"),
         "x2_strobe": Variable("velocity at that strobe", dimension="velocity"),
-        "exponent": Variable("largest Lyapunov exponent, where no period was found"),
-        "exponent_error": Variable("its standard error"),
-        "transient": Variable("time at which the attractor was known"),
+        "exponent": Variable(
+            "largest Lyapunov exponent, where no period was found", dimension="rate"
+        ),
+        "exponent_error": Variable("its standard error", dimension="rate"),
+        "transient": Variable("time at which the attractor was known", dimension="time"),
         "n_events": Variable("number of events (of a periodic motion: in one period)", "int32"),
     }
 
