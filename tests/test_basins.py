@@ -79,7 +79,6 @@ def test_the_bound_is_told_where_all_starts_agree():
     assert "equilibrium 0.25000 +- 0.01369, cycle 0.75000" in repr(stability(0.75, 1000))
 
 
-@pytest.mark.slow(first=True)
 def test_grid_is_split_by_the_unstable_cycle():
     x1, x2 = np.linspace(-1.0, 2.0, 41), np.linspace(-1.3, 1.7, 37)
     found = jb.basins(belt_drive(1.4), x1=x1, x2=x2, progress=False)

@@ -13,6 +13,8 @@ from scipy.optimize import brentq
 import jaxbelt as jb
 from jaxbelt import Status
 
+FIRST = pytest.mark.slow(first=True)
+
 
 def nu0(osc):
     return osc.belts[0].velocity
@@ -171,10 +173,10 @@ def test_a_law_with_a_jump():
 @pytest.mark.parametrize(
     ("condition", "nu", "status"),
     [
-        (jb.GrazingSliding(0), 0.52, Status.NOT_TOUCHED),
+        pytest.param(jb.GrazingSliding(0), 0.52, Status.NOT_TOUCHED, marks=FIRST),
         (jb.GrazingSliding(1), 0.52, Status.OTHER_KIND),
-        (jb.NonsmoothFold(0), -0.45, Status.OTHER_KIND),
-        (jb.SlidingExchange((0, 1)), 0.6, Status.NOT_TOUCHED),
+        pytest.param(jb.NonsmoothFold(0), -0.45, Status.OTHER_KIND, marks=FIRST),
+        pytest.param(jb.SlidingExchange((0, 1)), 0.6, Status.NOT_TOUCHED, marks=FIRST),
         (jb.SuddenSliding(1), 0.3, Status.NO_CONVERGENCE),
     ],
 )
@@ -186,7 +188,9 @@ def test_a_guess_that_fits_no_such_point_is_told_so(condition, nu, status):
     assert "jb.scan with a span" in repr(point)
 
 
-@pytest.mark.parametrize("offset", [-0.03, -0.004, 0.004, 0.03])
+@pytest.mark.parametrize(
+    "offset", [-0.03, *(pytest.param(d, marks=FIRST) for d in (-0.004, 0.004)), 0.03]
+)
 def test_a_fold_from_where_newtons_method_alone_does_not_find_it(offset):
     law = jb.Conti(1.0, 0.6, 10.0)
 
@@ -205,7 +209,9 @@ def test_a_fold_from_where_newtons_method_alone_does_not_find_it(offset):
     assert abs(point.value - expected) <= point.error + 1e-11
 
 
-@pytest.mark.parametrize("offset", [-0.03, -1e-3, 1e-3, 0.03])
+@pytest.mark.parametrize(
+    "offset", [-0.03, *(pytest.param(d, marks=FIRST) for d in (-1e-3, 1e-3)), 0.03]
+)
 def test_grazing_from_where_newtons_method_alone_does_not_find_it(offset):
     """A thousandth from where belt 0 is at rest, beyond which there is no such cycle."""
 

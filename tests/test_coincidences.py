@@ -4,6 +4,7 @@ Each case went wrong once, in the sweep or in `find_cycle`. The oracle is the en
 campaigns, `tests/campaign/engine.py`; `judge` says what counts as right (docs/checked.md).
 """
 
+import lists
 import numpy as np
 import oracle
 import oracle_cycles
@@ -262,12 +263,8 @@ def test_an_orbit_that_leaves_its_rest_slowly_is_followed_to_its_cycle():
 
 def test_huge_loads_do_not_stop_a_sweep():
     law = jb.Conti(1.0, 0.6, 10.0)
-    found = jb.sweep(
-        lambda load: jb.Oscillator(0.5, (jb.Belt(0.3, law, load),)),
-        {"load": [1e8]},
-        t1=50.0,
-        progress=False,
-    )
+    osc = jb.Oscillator(0.5, (jb.Belt(0.3, law, 1e8), jb.Belt(0.3, law, 0.0)))
+    found = lists.swept([osc], y0=(3.0, 0.0), t1=50.0)
     # It sticks at once (after 4e-9) and is carried along.
     assert found.status == Status.OK and found.n_events == 1
     np.testing.assert_allclose(found.x1_end, 3.0 + 0.3 * 50.0, rtol=0, atol=1e-7)
@@ -284,7 +281,13 @@ def test_audits_find_nothing(observe):
     assert (found.attrs["audited"], found.attrs["audit_differed"]) == (5, 0)
 
 
-@pytest.mark.parametrize("observe", ["final", pytest.param("attractor", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "observe",
+    [
+        pytest.param("final", marks=pytest.mark.slow(first=True)),
+        pytest.param("attractor", marks=pytest.mark.slow),
+    ],
+)
 def test_audits_find_repeats_that_are_none(observe, monkeypatch):
     def in_part(mark, lanes, close):
         same = code_of(lanes.mode) == mark.code

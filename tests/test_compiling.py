@@ -1,6 +1,5 @@
 """How functions are compiled: the same results in and out of traces, and nothing needlessly."""
 
-import functools
 import os
 import threading
 
@@ -85,12 +84,9 @@ SAME_PROGRAM = {
 CLASS_B, OTHER = jb.presets.class_b(0.45, 0.35), jb.presets.class_b(0.41, 0.3)
 
 
-ALONG_NU0 = functools.partial(jb.presets.class_b, nu1=0.35)
-
-
 def swept(count, y0):
-    axes = {"nu0": np.linspace(0.1, 0.1 * count, count)}
-    return jb.sweep(ALONG_NU0, axes, y0=y0, t1=20.0 + count, observe="final")
+    axes = {"nu0": np.linspace(0.1, 0.1 * count, count), "nu1": [0.35]}
+    return jb.sweep(jb.presets.class_b, axes, y0=y0, t1=20.0 + count, observe="final")
 
 
 @pytest.mark.parametrize("name", SAME_PROGRAM)
@@ -102,12 +98,15 @@ def test_numbers_decide_no_program(name):
     assert compiled == []
 
 
+SIMULATE = jax.jit(lambda y0, ts: jb.simulate(CLASS_B, y0, 40.0, ts=ts))
+
+
 @pytest.mark.parametrize("end", [40.0, 39.0])
 def test_padded_times_are_those_that_were_asked_for(end):
     ts = np.linspace(0.0, end, 37)
     found = jb.simulate(CLASS_B, (3.0, 0.0), 40.0, ts=ts)
     # In a trace the times are not padded.
-    unpadded = jax.jit(lambda y0: jb.simulate(CLASS_B, y0, 40.0, ts=ts))(np.array([3.0, 0.0]))
+    unpadded = SIMULATE(np.array([3.0, 0.0]), ts)
     np.testing.assert_array_equal(found.ts, ts)
     # Samples are flown from one to the next, in pieces that may begin at other ones.
     np.testing.assert_allclose(found.ys, unpadded.ys, rtol=0, atol=1e-9)

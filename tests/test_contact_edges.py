@@ -630,6 +630,7 @@ def test_the_kinetic_end_of_a_segment_comes_to_an_edge(velocity, kind):
     assert float(again.value) == pytest.approx(0.25, abs=1e-12)
 
 
+@pytest.mark.slow(first=True)
 def test_where_the_mass_is_pushed_back_nothing_ends_at_the_kinetic_limit():
     def make(edge):
         belts = (

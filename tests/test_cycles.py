@@ -133,16 +133,16 @@ def test_relaxation_cycle_of_a_strongly_damped_oscillator(damping, nu, load):
 @pytest.mark.parametrize(
     ("name", "velocities"),
     [
-        ("class_b", (0.28, 0.35)),
         ("class_b", (0.3, 0.35)),
-        ("class_b", (0.45, 0.35)),
-        ("class_b", (0.53, 0.35)),
         ("class_b", (0.5387, 0.35)),
         ("class_b", (-0.3, 0.35)),
-        ("class_b", (-0.55, 0.35)),
-        ("class_a", (0.184,)),
-        ("class_a", (0.22,)),
-        ("class_a", (0.265,)),
+        *(
+            pytest.param(name, velocities, marks=pytest.mark.slow(first=True))
+            for name, velocities in (
+                *(("class_b", (nu, 0.35)) for nu in (0.28, 0.45, 0.53, -0.55)),
+                *(("class_a", (nu,)) for nu in (0.184, 0.22, 0.265)),
+            )
+        ),
     ],
 )
 def test_unstable_cycle_is_that_of_the_oracle(name, velocities):
@@ -161,6 +161,7 @@ def test_there_is_no_unstable_cycle_outside_of_hopf_point_and_fold(nu):
     assert cycle.status == Status.NO_UNSTABLE_CYCLE and jnp.isnan(cycle.period)
 
 
+@pytest.mark.slow(first=True)
 def test_no_cycle_crosses_where_the_mass_would_stick():
     """Crossing-sliding is at a damping of -0.595658067405: above it the cycle of class (a) sticks,
     and what solves the equations of the one that crosses is no motion of the oscillator."""
@@ -487,6 +488,7 @@ def test_a_batch_of_cycles_is_each_of_them():
         np.testing.assert_allclose(numbers[i, 0], found.period, rtol=1e-11)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("offset", [-1e-7, -1e-9, 1e-9, 1e-7])
 def test_an_orbit_that_all_but_touches_an_edge(offset):
     """Where it does it is pushed over it and comes to rest; the cycle touches it at this load."""
@@ -496,6 +498,7 @@ def test_an_orbit_that_all_but_touches_an_edge(offset):
     assert cycle.status == (Status.OK if offset > 0 else Status.EQUILIBRIUM)
 
 
+@pytest.mark.slow(first=True)
 def test_a_cycle_beside_circles_that_hardly_sticks():
     """The static limit is above kinetic friction by so little that it sticks for 1e-4 of its
     period, by a distance of twice the excess; the rest is an arc of a circle."""

@@ -611,7 +611,8 @@ def test_the_error_of_a_double_root_is_told(start):
     assert point.status != Status.OK or abs(point.value - 0.3) <= point.error
 
 
-@pytest.mark.parametrize("unit", [1e3, pytest.param(1e-3, marks=pytest.mark.slow(first=True))])
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("unit", [1e3, 1e-3])
 def test_the_unit_of_the_parameter_makes_no_difference(unit):
     along = _edge_beside_the_equilibrium(lambda v: 4e-16 * jnp.sin(1e3 * v))
     found = jb.scan(lambda s: along(s / unit), span=(0.22 * unit, 0.24 * unit), resolution=4)
@@ -632,6 +633,7 @@ def test_a_span_that_is_hardly_longer_than_a_point():
     assert rest.kind == "SuddenSliding" and abs(rest.value) < 1e-14
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("varied", ["velocity", "damping"])
 def test_two_equilibria_that_change_at_one_value(varied):
     """A mirror image of itself: two fixed points, the same distance from the middle."""

@@ -308,7 +308,7 @@ def test_a_belt_at_rest_ends_a_pseudo_focus_in_finite_time():
 
 
 def test_a_fixed_point_on_an_edge_is_listed_once_with_its_zone():
-    law = jb.Coulomb(0.5, 0.5)
+    law = jb.Conti(0.5, 0.5, 10.0)
     left = jb.Oscillator(0.5, (jb.Belt(0.3, law, upper=0.5), jb.Belt(-0.3, law, lower=0.5)))
     right = jb.Oscillator(0.5, (jb.Belt(0.3, law, upper=-0.5), jb.Belt(-0.3, law, lower=-0.5)))
     for osc, x1, modes in [(left, 0.5, [1, -2]), (right, -0.5, [2, -1])]:
@@ -529,6 +529,7 @@ def test_a_fixed_point_at_the_end_of_a_segment_is_that(mirrored):
     assert sorted([abs(points.x1_lower[0]), abs(points.x1_upper[0])]) == [0.0, 1.0]
 
 
+@pytest.mark.slow(first=True)
 def test_derivatives_of_the_ends_of_a_segment():
     def ends(static, load, nu, edge):
         law = jb.Conti(static, 0.6, 10.0)
@@ -676,7 +677,7 @@ def test_a_law_of_ones_own_and_a_supercritical_point():
 #: Damping 0 and friction that does not depend on the speed; on both sides of an edge; laws whose
 #: sum is even in the velocity: c - 0.05 x2^2 (damping 0), and a constant (damping 4 * 0.05).
 CENTRES = {
-    "constant": (0.0, jb.Belt(2.0, jb.Coulomb(1.0, 0.6))),
+    "constant": (0.0, jb.Belt(2.0, jb.Conti(0.6, 0.6, 10.0))),
     "an edge": (
         0.0,
         jb.Belt(2.0, jb.Coulomb(0.8, 0.6), upper=0.1),
@@ -802,7 +803,7 @@ def test_edges_that_differ_by_rounding_are_one(edges):
 
 
 def test_what_a_belt_at_rest_holds_in_one_point_is_no_segment():
-    held = jb.Belt(0.0, jb.Coulomb(0.8, 0.8), lower=0.0, upper=0.85)
+    held = jb.Belt(0.0, jb.Conti(0.8, 0.8, 10.0), lower=0.0, upper=0.85)
     osc = jb.Oscillator(0.5, (jb.Belt(0.3, jb.Conti(1.2, 0.7, 10.0), 2.0), held))
     rests = jb.equilibria(osc)  # 2 * 0.825 - 0.8 = 0.85
     assert rests.kind.tolist() == [jb.EquilibriumKind.FIXED_POINT]

@@ -40,7 +40,9 @@ bifurcation_curve bifurcation_diagram circle_map class design distance_to distan
 find_cycle fit minimal_fatal_shock orbit_diagram plot_basins portrait region_map scan
 """.split()
 #: Long, and the only examples of what they show.
-FIRST = "Arcs", "Basins-class", "explore", "forcing", "laws", "simulate"
+FIRST = """
+Arcs Basins-class HopfAtInfinity Tabulated explore forcing in_si laws lyapunov simulate verify
+""".split()
 
 
 def examples(path: Path) -> str:

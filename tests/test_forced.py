@@ -64,10 +64,12 @@ def test_text_of_a_forced_oscillator_makes_it_again():
 
 def test_a_frequency_of_zero_is_a_constant_force_without_a_clock():
     push = 0.5 * cos(0.3)
-    osc = forced_one(forcing=jb.Harmonic(0.5, 0.0, 0.3), velocity=jb.Oscillating(0.2, 0.1, 0, 0.0))
+    law = jb.Conti(1.0, 0.6, 10.0)  # that of class (a), for one program without forcing
+    velocity = jb.Oscillating(0.2, 0.1, 0, 0.0)
+    osc = forced_one(law=law, forcing=jb.Harmonic(0.5, 0.0, 0.3), velocity=velocity)
     assert not has_clock(osc)
     assert float(osc.belts[0].velocity) == pytest.approx(0.3, abs=1e-15)
-    still = forced_one(forcing=())
+    still = forced_one(law=law, forcing=())
     rest, rest_still = jb.equilibria(osc), jb.equilibria(still)
     np.testing.assert_allclose(rest.x1, rest_still.x1 + push, atol=1e-15)
     cycle, cycle_still = jb.find_cycle(osc, (1.0, 0.0)), jb.find_cycle(still, (1.0 - push, 0.0))
@@ -77,6 +79,7 @@ def test_a_frequency_of_zero_is_a_constant_force_without_a_clock():
     assert has_clock(forced_one())
 
 
+@pytest.mark.slow(first=True)
 def test_a_constant_force_in_a_sweep_is_the_origin_moved():
     def make(push):
         return forced_one(law=jb.Conti(1.0, 0.6, 10.0), forcing=jb.Harmonic(push, 0.0))
@@ -310,6 +313,7 @@ def test_a_moving_support_is_a_force():
     assert_same(end_of(forced_one()), end_of(forced_one(forcing=base)))
 
 
+@pytest.mark.slow(first=True)
 def test_a_force_in_two_halves_is_one():
     half = jb.Harmonic(0.45, 1.3, 0.4)
     assert_same(end_of(forced_one()), end_of(forced_one(forcing=(half, half))))

@@ -344,6 +344,7 @@ def test_design_says_why_it_ends():
     assert int(nothing.status) == jb.Status.NOT_SETTLED and np.isnan(nothing.achieved[0])
 
 
+@pytest.mark.slow(first=True)
 def test_designs_do_not_depend_on_the_unit_of_length():
     belt, force = jb.Belt(0.0, jb.Coulomb(0.4, 0.4), 4.0), jb.Harmonic(4.0, 0.7)
     large = jb.Oscillator(0.05, (belt,), forcing=force)

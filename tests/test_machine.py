@@ -68,6 +68,8 @@ def test_friction_force(run):
     x, v = ours.x1.values, ours.x2.values
     stuck = (ours["mode"].values == 0).any(axis=1)
     assert 500 < stuck.sum() < 3500
+    with pytest.raises(ValueError, match="result must be dimensionless, got a dataset that is in"):
+        jb.in_si(ours, machine())
     # Nothing is accelerated where it sticks: the force is that of spring and dashpot.
     assert np.allclose(ours.force[stuck], (STIFFNESS * x + DAMPING * v)[stuck], rtol=1e-12)
     # Else it is what the laws say, in newtons at metres per second.
@@ -786,6 +788,7 @@ def test_units_show_their_values():
     assert repr(machine.units) == shown
 
 
+@pytest.mark.slow(first=True)
 def test_what_is_in_si_units_is_not_scaled_again():
     belt = jb.PhysicalBelt(0.1, jb.Coulomb(0.5, 0.4), 20.0)
     machine = jb.Machine(mass=2.0, stiffness=800.0, damping=4.0, belts=(belt,))

@@ -220,6 +220,7 @@ def test_no_number_depends_on_the_unit_of_length(sticking):
     np.testing.assert_array_equal(motion.stick_durations, sticking.stick_durations)
 
 
+@pytest.mark.slow(first=True)
 def test_grazing_of_the_motion_of_four_periods(smooth):
     point = jb.refine(jb.GrazingSliding(0), bkn(1.7079), where=frequency_of, start=smooth)
     assert int(point.status) == OK

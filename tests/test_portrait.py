@@ -495,6 +495,7 @@ def test_separatrices_come_from_out_of_reach_where_loops_hardly_grow():
         assert one.end == "outside" and np.max(np.abs(np.asarray(one.ys))) >= told.reach
 
 
+@pytest.mark.slow(first=True)
 def test_a_belt_at_rest_without_load_changes_nothing():
     """Its boundary lies where x1 is extremal: which of the two ends an arc is not left to rounding,
     by which lowest points of x1 were taken for the highest ones."""

@@ -563,7 +563,8 @@ def test_an_excursion_within_one_step_is_found():
     # Undamped, no friction: x2 = 1 * cos; it tops the slow belt's velocity by 1e-7 for 9e-4.
     law = jb.Coulomb(static=1e-9, kinetic=1e-9)
     nu = 1.0 - 1e-7
-    osc = coulomb_belts(jb.Belt(nu, law), jb.Belt(50.0, law))
+    # With an edge where it does not come to, for the program of the tests above.
+    osc = coulomb_belts(jb.Belt(nu, law), jb.Belt(50.0, law, upper=50.0))
     run = simulate(osc, (-1.0, 0.0), 12.0)
     assert [kind for kind, _ in kinds(run)] == ["CROSS"] * 4
     width = 2 * np.arccos(nu)
@@ -824,7 +825,10 @@ def test_no_samples_in_a_batch():
 #: the engine of the campaigns the number of events until 50 and the state there.
 THIN = [
     ((2.487, 0.475), 0.098, [(0.2328, 0.446)], 5, (0.2534408535373042, 0.04556610074149681)),
-    ((-1.35, 0.0), 0.05, [(0.35, 1.0)], 15, (0.25506473732934754, 0.32444510417110334)),
+    pytest.param(
+        *((-1.35, 0.0), 0.05, [(0.35, 1.0)], 15, (0.25506473732934754, 0.32444510417110334)),
+        marks=pytest.mark.slow(first=True),
+    ),
     pytest.param(
         *((3.0, 0.0), 0.2, [(-0.55, 1.5), (0.95, 2.0)]),
         *(3, (0.2915785057334776, -0.0017051355186067396)),

@@ -73,13 +73,8 @@ def test_a_mass_at_rest_is_near_no_edge():
 def test_a_motion_that_grows_beyond_all_bounds_keeps_nobody_waiting(observe):
     """At 1e103 cubes overflow and steps become ever smaller; so many would be made until t1."""
     belts = jb.presets.class_b(0.3, 0.35).belts
-    dataset = jb.sweep(
-        lambda damping: jb.Oscillator(damping, belts),
-        {"damping": [-0.1, 0.5], "x1": [20.0]},
-        y0=(0.0, 5.0),
-        t1=30_000.0,
-        observe=observe,
-    )
+    oscillators = [jb.Oscillator(damping, belts) for damping in (-0.1, 0.5)]
+    dataset = lists.swept(oscillators, y0=(20.0, 5.0), t1=30_000.0, observe=observe)
     grows, settles = dataset.status.values.ravel()
     assert grows == Status.NOT_FINITE and settles == Status.OK
 
