@@ -9,15 +9,12 @@ import pytest
 from laws import BELL, bell, peak
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
+from where import nu0
 
 import jaxbelt as jb
 from jaxbelt import Status
 
 FIRST = pytest.mark.slow(first=True)
-
-
-def nu0(osc):
-    return osc.belts[0].velocity
 
 
 def class_b(nu):

@@ -1,7 +1,6 @@
 """`circle_map` against `find_cycle`, runs of SciPy and of `simulate`, closed forms, relations that
 must hold, and the engine of tests/campaign/forced.py."""
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -198,7 +197,6 @@ def test_where_needed_comes_back_from_the_limit_there_is_no_onset():
     assert np.array_equal(table.is_onset[~table.fixed_point], leaves)
     (patch,) = strong.plot().collections
     assert patch.get_label() == "no onset"
-    plt.close("all")
 
 
 def test_what_does_not_stick_again_in_time_is_nan(found):
@@ -271,7 +269,6 @@ def test_the_picture_has_gaps_where_the_map_jumps(found):
     assert stable.get_markerfacecolor() == "black" and unstable.get_markerfacecolor() == "white"
     assert len(stable.get_xdata()) == 1 and len(unstable.get_xdata()) == len(found.motions) - 1
     assert [text.get_text() for text in ax.get_xticklabels()][2] == r"$\pi$"
-    plt.close("all")
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import oracle_cycles
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
+from where import nu0, nu1
 
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
@@ -17,14 +18,6 @@ from jaxbelt.bifurcations.path import ParameterPath
 from jaxbelt.numerics.continuation import Stop
 
 EDGE = EventKind.EDGE
-
-
-def nu0(osc):
-    return osc.belts[0].velocity
-
-
-def nu1(osc):
-    return osc.belts[1].velocity
 
 
 def sigma1(osc):

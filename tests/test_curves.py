@@ -10,6 +10,7 @@ import oracle_cycles
 import pytest
 from laws import BELL, bell
 from scipy.optimize import brentq
+from where import nu0, nu1, zeta
 
 import jaxbelt as jb
 from jaxbelt.bifurcations.systems import Seen
@@ -19,15 +20,6 @@ from jaxbelt.model.parameters import leaf_index
 from jaxbelt.model.variations import Variation
 from jaxbelt.numerics.continuation import Corrected, CurvePoint, Stop
 from tests.campaign import engine
-
-
-def nu0(osc):
-    return osc.belts[0].velocity
-
-
-def nu1(osc):
-    return osc.belts[1].velocity
-
 
 PLANE = ((-0.7, 0.7), (-0.7, 0.7))
 
@@ -82,10 +74,6 @@ def test_every_row_is_what_refine_finds(fold):
     # Both are exact up to the error of the integration, some 1e-12.
     assert max(errors(fold, osc, (nu0, nu1), jb.GrazingSliding(1), rows)) < 1e-9
     assert np.max(fold.residual) < 1e-12 and np.all(np.isfinite(fold.values))
-
-
-def zeta(osc):
-    return osc.damping
 
 
 def steepness(osc):
@@ -475,8 +463,8 @@ def test_a_point_where_the_cycle_passes_an_edge_in_two_corners_is_told_along_all
         return jb.presets.class_c(nu0, nu1, -0.5)
 
     found = []
-    for nu1, guess in ((-0.2343, 0.255), (-0.2383, 0.235), (-0.2322, 0.23), (-0.2291, 0.23)):
-        point = jb.refine(jb.CornerCollision(0), functools.partial(make, nu1=nu1), at=guess)
+    for velocity, guess in ((-0.2343, 0.255), (-0.2383, 0.235), (-0.2322, 0.23), (-0.2291, 0.23)):
+        point = jb.refine(jb.CornerCollision(0), functools.partial(make, nu1=velocity), at=guess)
         curve = jb.bifurcation_curve(point, make, ((0.225, 0.26), (-0.25, -0.22)))
         (double,) = curve.special
         assert double.kind == "DoubleSliding" and double.residual < 1e-12

@@ -3,11 +3,11 @@
 import dataclasses
 import functools
 
-import matplotlib.pyplot as plt
 import numpy as np
 import oracle
 import oracle_cycles
 import pytest
+from where import nu0
 
 import jaxbelt as jb
 from jaxbelt import EventKind
@@ -17,10 +17,6 @@ from jaxbelt.bifurcations.faces import Faces
 from jaxbelt.bifurcations.labels import Label
 from jaxbelt.bifurcations.regions import RegionMap
 from jaxbelt.plotting.diagrams import _between_rows
-
-
-def nu0(osc):
-    return osc.belts[0].velocity
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +125,6 @@ def test_picture(diagram):
         diagram.plot(quantity="x3")
     with pytest.raises(ValueError, match=r"one number, got one that returns float64\[2\]"):
         diagram.plot(quantity=lambda cycle: cycle.stick_durations)
-    plt.close("all")
 
 
 def heights(ax, label):
@@ -160,7 +155,6 @@ def test_picture_of_any_functional(diagram):
     assert own.get_ylabel() == "quantity" and named.get_ylabel() == "period $T$"
     sticks = diagram.plot(quantity=functools.partial(jb.stick_duration, belt=1))
     assert sticks.get_ylabel() == "stick duration (belt 1)"
-    plt.close("all")
 
 
 def test_amplitude_is_drawn_where_x2_would_be_the_velocity_of_the_belt(diagram):
@@ -180,7 +174,6 @@ def test_amplitude_is_drawn_where_x2_would_be_the_velocity_of_the_belt(diagram):
     rests = [branch for branch in diagram.branches if branch.kind == "equilibrium"]
     only = dataclasses.replace(diagram, branches=tuple(rests))
     assert only.plot().get_ylabel() == "displacement $x_1$"
-    plt.close("all")
 
 
 def test_table_has_every_row_and_point(diagram):
@@ -222,7 +215,6 @@ def test_names_of_regions_stand_in_the_plane_of_the_paper_only(diagram):
     assert not in_plane_of_paper([jb.Oscillator(0.5, [jb.Belt(v, law) for v in (0.1, 0.2, 0.3)])])
     elsewhere = dataclasses.replace(diagram, as_paper=False)
     assert not {"6", "4a", "2b"} & {text.get_text() for text in elsewhere.plot().texts}
-    plt.close("all")
 
 
 def test_picture_shows_stick_velocities_and_dashes_what_is_unstable(diagram):

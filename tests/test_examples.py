@@ -83,7 +83,6 @@ def test_the_page_on_scaling_runs():
         for osc, one in ((own.oscillator, own), (held, m))
     )
     assert next(periods) == pytest.approx(next(periods), rel=1e-9)
-    plt.close("all")
 
 
 def test_the_code_of_the_gallery_runs_after_the_lines_that_it_shows():
@@ -102,7 +101,6 @@ def test_the_code_of_the_gallery_runs_after_the_lines_that_it_shows():
             assert used - local <= {*given, *dir(builtins)}, one.name
     assert not shown
     assert len(given["friction_laws"]().axes) == 3
-    plt.close("all")
 
 
 @pytest.mark.parametrize(
@@ -120,5 +118,4 @@ def test_example_prints_what_its_page_says(page):
     test = doctest.DocTestParser().get_doctest(examples(path), dict(GIVEN), page, str(path), 0)
     told: list[str] = []
     doctest.DocTestRunner(optionflags=options).run(test, out=told.append)
-    plt.close("all")
     assert not told, "".join(told)

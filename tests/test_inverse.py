@@ -6,6 +6,7 @@ import numpy as np
 import oracle
 import oracle_cycles
 import pytest
+from where import nu0
 
 import jaxbelt as jb
 from jaxbelt import Status
@@ -356,10 +357,6 @@ def test_impossible_arguments_are_named(change, message):
 
 def stick(cycle):
     return jb.stick_duration(cycle, 1)
-
-
-def nu0(osc):
-    return osc.belts[0].velocity
 
 
 @pytest.mark.slow(first=True)

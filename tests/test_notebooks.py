@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 
 import jax
-import matplotlib.pyplot as plt
 import pytest
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
@@ -29,4 +28,3 @@ def test_notebook_runs(path):
             # Optax relies on promotion, as users of a notebook may.
             with jax.numpy_dtype_promotion("standard"):
                 exec(compile(source, path.name, "exec"), namespace)
-    plt.close("all")

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from where import nu0, nu1
 
 import jaxbelt as jb
 from jaxbelt.model.own_units import in_own_units, in_units_of_user, own_length, power_of_two_below
@@ -25,14 +26,6 @@ def oscillator(nu0=0.45, nu1=0.35, *, length=1.0, omega=1.0, damping=0.5, **edge
     edges = {name: value * length for name, value in edges.items()}
     belts = jb.Belt(nu0 * speed, law, length, **edges), jb.Belt(nu1 * speed, law, length)
     return jb.Oscillator(damping, belts, omega)
-
-
-def nu0(osc):
-    return osc.belts[0].velocity
-
-
-def nu1(osc):
-    return osc.belts[1].velocity
 
 
 def powers_of(name, length, speed):

@@ -6,7 +6,6 @@ The campaign is `python -m tests.campaign portraits`; what it found is in docs/c
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 import oracle
 import pytest
@@ -96,7 +95,6 @@ def test_picture_shows_everything(class_d):
     labels = [line.get_label() for line in ax.get_lines()]
     assert labels.count("stable cycle") == 2 and labels.count("saddle") == 2
     assert labels.count("stable separatrix") == labels.count("unstable separatrix") == 4
-    plt.close("all")
 
 
 def test_bad_arguments_are_refused_by_name():

@@ -6,13 +6,10 @@ import oracle
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, minimize_scalar
+from where import nu0
 
 import jaxbelt as jb
 from jaxbelt.bifurcations.switch_folds import switch_band, switch_fold
-
-
-def nu0(osc):
-    return osc.belts[0].velocity
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,7 @@ import oracle
 import oracle_cycles
 import pytest
 from compilations import compilations
+from where import nu0
 
 import jaxbelt as jb
 from jaxbelt import Status
@@ -19,10 +20,6 @@ from jaxbelt.model.variations import Variation
 
 #: Where the fixed point of class (a) changes its stability, eq. (28) of the paper.
 HOPF = (np.sqrt(8) - 1) / 10
-
-
-def nu0(osc):
-    return osc.belts[0].velocity
 
 
 # --- what it makes --------------------------------------------------------------------------------
