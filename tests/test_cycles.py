@@ -17,6 +17,7 @@ from scipy.integrate import solve_ivp
 
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
+from jaxbelt.cycles.attractors import itinerary
 from jaxbelt.cycles.chains import cut
 from jaxbelt.cycles.cycle import FINE_STEPS, as_loop, polish
 from jaxbelt.motion.arcs import Ends
@@ -554,3 +555,17 @@ def test_an_unstable_cycle_close_inside_one_that_attracts_is_found_from_either_s
     assert all(cycle.status == Status.OK and cycle.multiplier > 1 for cycle in found)
     np.testing.assert_allclose(found[0].x1_min, -found[1].x1_max, rtol=1e-10)
     np.testing.assert_allclose(found[0].period, found[1].period, rtol=1e-10)
+
+
+def test_a_stick_phase_that_ends_on_an_edge_and_by_slip_onset():
+    """Which comes first is rounding, and no mode of a cycle: it repeats at the same values."""
+    law = jb.Conti(1.0, 0.6, 10.0)
+
+    def make(residual):
+        other = jb.Conti(1.0, residual, 10.0)
+        belts = jb.Belt(-0.6, law, 1.5, lower=-1.47, upper=0.15), jb.Belt(-0.6, other, 1.5)
+        return jb.Oscillator(0.05, belts)
+
+    for residual in (0.553149166667, 0.6):
+        cycle = jb.find_cycle(make(residual), (-1.0, 0.0))
+        assert itinerary(cycle.oscillator, cycle) == ((-2, -1), (-1, -1), (0, 0))

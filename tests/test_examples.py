@@ -6,6 +6,7 @@ One page a test. The names that the index of the reference takes for granted are
 import ast
 import builtins
 import doctest
+import json
 import re
 from pathlib import Path
 
@@ -119,3 +120,30 @@ def test_example_prints_what_its_page_says(page):
     told: list[str] = []
     doctest.DocTestRunner(optionflags=options).run(test, out=told.append)
     assert not told, "".join(told)
+
+
+# --- notebooks, in the small setting where they have one ------------------------------------------
+
+
+NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
+#: What the others show takes minutes, and has tests of its own.
+BY_DAY = ("01_first_steps", "02_sweeps", "06_atlas", "08_response")
+
+
+@pytest.mark.filterwarnings("ignore:FigureCanvasAgg is non-interactive:UserWarning")
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(path, marks=pytest.mark.slow(first=path.stem in BY_DAY), id=path.stem)
+        for path in NOTEBOOKS
+    ],
+)
+def test_notebook_runs(path):
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    namespace = {}
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            source = "".join(cell["source"]).replace("\nFULL = True", "\nFULL = False")
+            # Optax relies on promotion, as users of a notebook may.
+            with jax.numpy_dtype_promotion("standard"):
+                exec(compile(source, path.name, "exec"), namespace)

@@ -577,7 +577,7 @@ def _both_sides(path: OwnPath, point, special, brute: Brute, report: Report) -> 
     if away < 1e-9 or at - away < first or at + away > last:
         return
     if point.kind == "HopfAtInfinity":
-        return  # tests/test_infinity.py has its closed forms
+        return  # tests/test_bifurcations.py has its closed forms
     if point.kind == "SaddleConnection":
         if not _part(brute.case, path.orbit(point), float(point.place[4]), at, away):
             report.wrong.append(f"no orbits part at {point!r}")

@@ -4,17 +4,11 @@ Each case went wrong once, in the sweep or in `find_cycle`. The oracle is the en
 campaigns, `tests/campaign/engine.py`; `judge` says what counts as right (docs/checked.md).
 """
 
-import lists
 import numpy as np
-import oracle
-import oracle_cycles
 import pytest
 
 import jaxbelt as jb
-from jaxbelt.cycles.attractors import itinerary
-from jaxbelt.kernel.marks import Mark, code_of
-from jaxbelt.results import Status
-from jaxbelt.sweeps import threads
+from jaxbelt import Status
 from tests.campaign import compare, engine, package
 from tests.campaign.cases import PAPER, Case
 from tests.campaign.engine import Belt, Oscillator
@@ -259,138 +253,3 @@ def test_an_orbit_that_leaves_its_rest_slowly_is_followed_to_its_cycle():
     (label,) = package.labels([Case(osc, (0.0, 0.0), 50.0, "rational")], 1e-8)
     # By the engine.
     assert label.kind == "cycle" and label.period == pytest.approx(6.362879660, abs=1e-8)
-
-
-def test_huge_loads_do_not_stop_a_sweep():
-    law = jb.Conti(1.0, 0.6, 10.0)
-    osc = jb.Oscillator(0.5, (jb.Belt(0.3, law, 1e8), jb.Belt(0.3, law, 0.0)))
-    found = lists.swept([osc], y0=(3.0, 0.0), t1=50.0)
-    # It sticks at once (after 4e-9) and is carried along.
-    assert found.status == Status.OK and found.n_events == 1
-    np.testing.assert_allclose(found.x1_end, 3.0 + 0.3 * 50.0, rtol=0, atol=1e-7)
-
-
-# --- audits ---------------------------------------------------------------------------------------
-
-AXES = {"nu0": np.array([0.2, 0.4, 0.6]), "nu1": np.array([-0.9, -0.4, 0.3])}
-
-
-@pytest.mark.parametrize("observe", ["final", "attractor"])
-def test_audits_find_nothing(observe):
-    found = jb.sweep(jb.presets.class_b, AXES, t1=200.0, observe=observe, audit=0.5, progress=False)
-    assert (found.attrs["audited"], found.attrs["audit_differed"]) == (5, 0)
-
-
-@pytest.mark.parametrize(
-    "observe",
-    [
-        pytest.param("final", marks=pytest.mark.slow(first=True)),
-        pytest.param("attractor", marks=pytest.mark.slow),
-    ],
-)
-def test_audits_find_repeats_that_are_none(observe, monkeypatch):
-    def in_part(mark, lanes, close):
-        same = code_of(lanes.mode) == mark.code
-        return same & (abs(lanes.x1 - mark.x1) <= close)
-
-    monkeypatch.setattr(Mark, "met_by", in_part)
-    threads.compiled.cache_clear()
-    with pytest.warns(UserWarning, match="1 of 9 audited runs differ .* indices \\(2, 0\\)"):
-        found = jb.sweep(
-            jb.presets.class_b, AXES, t1=60.0, observe=observe, audit=1.0, progress=False
-        )
-    threads.compiled.cache_clear()
-    assert found.attrs["audit_differed"] == 1
-
-
-def test_what_cannot_be_audited_is_refused():
-    with pytest.raises(ValueError, match="audit must be a share from 0 to 1, got 2"):
-        jb.sweep(jb.presets.class_b, AXES, t1=1.0, audit=2.0)
-
-
-def test_belts_that_change_places_where_a_cycle_sticks_to_both():
-    """The slip arc between the two stick phases takes no time at the point; the cycle there is
-    that of one belt with the load of both."""
-    law = jb.Conti(1.2, 0.48, 10.0)
-
-    def make(velocity):
-        return jb.Oscillator(0.1, (jb.Belt(-0.55, law), jb.Belt(velocity, law)))
-
-    one = oracle.Oscillator(0.1, (oracle.Belt(-0.55, *oracle.conti(1.2, 0.48, 10.0), load=2.0),))
-    period = oracle_cycles.sticking_cycle(one).period
-    points = jb.scan(make, span=(-0.56, -0.54))
-    (point,) = [p for p in points if p.condition == jb.SlidingExchange((0, 1))]
-    assert "Unexplained" not in [p.kind for p in points]
-    for found in (point, *(jb.refine(point.condition, make, at=v) for v in (-0.551, -0.549))):
-        assert found.value == pytest.approx(-0.55, abs=1e-13)
-        assert found.cycle.period == pytest.approx(period, abs=1e-10)
-
-
-@pytest.mark.slow(first=True)
-def test_a_corner_at_a_value_that_the_search_looks_at():
-    """Slip onset on belt 1 is on its edge just where the belts run against each other, at -0.45,
-    a round part of the span."""
-
-    def make(velocity):
-        belts = (
-            jb.Belt(0.45, jb.Stribeck(0.5, 0.4, 0.4), 2.0),
-            jb.Belt(velocity, jb.Conti(0.8, 0.32, 1.0), 2.0, lower=-0.66642015508763, upper=0.5),
-        )
-        return jb.Oscillator(0.25, belts)
-
-    points = jb.scan(make, span=(-0.55, -0.35))
-    assert [point.condition for point in points] == [jb.CornerCollision(1)] * 2
-    assert points[1].value == pytest.approx(-0.45, abs=1e-12)
-
-
-@pytest.mark.slow(first=True)
-def test_an_arc_that_vanishes_as_a_square_is_told_by_its_corner():
-    """Where slip sets in just before the edge, belt 1 holds again just beyond it: what lies between
-    takes 1e-13 where the belt runs 8e-6 slower than at the corner."""
-    law = jb.Conti(1.0, 0.6, 10.0)
-    onset = -2.0 + 0.25 * 0.225 + (0.6 + 0.4 / (1 + 10 * 1.25))  # limit, damping, mu(1.25)
-
-    def make(velocity):
-        belts = (jb.Belt(velocity, law, lower=onset), jb.Belt(-0.45, law, 2.0))
-        return jb.Oscillator(0.25, belts, 2.0)
-
-    for span in ((0.75, 0.85), (0.7, 0.9)):
-        (corner,) = jb.scan(make, span=span)
-        assert corner.condition == jb.CornerCollision(0)
-        assert corner.value == pytest.approx(0.8, abs=1e-12)
-
-
-def test_a_stick_phase_that_ends_on_an_edge_and_by_slip_onset():
-    """Which comes first is rounding, and no mode of a cycle: it repeats at the same values."""
-    law = jb.Conti(1.0, 0.6, 10.0)
-
-    def make(residual):
-        other = jb.Conti(1.0, residual, 10.0)
-        belts = jb.Belt(-0.6, law, 1.5, lower=-1.47, upper=0.15), jb.Belt(-0.6, other, 1.5)
-        return jb.Oscillator(0.05, belts)
-
-    for residual in (0.553149166667, 0.6):
-        cycle = jb.find_cycle(make(residual), (-1.0, 0.0))
-        assert itinerary(cycle.oscillator, cycle) == ((-2, -1), (-1, -1), (0, 0))
-
-
-@pytest.mark.slow(first=True)
-def test_a_cycle_ends_just_beside_where_two_belts_run_together():
-    """It is told apart where no pseudo-focus is about, around which loops are lost in rounding."""
-
-    def numbers(velocity):
-        laws = ("coulomb", 0.504701, 0.2643582), ("coulomb", 0.88806, 0.7142546)
-        belts = (
-            Belt(-0.7094468, laws[0], 1.68557, upper=0.751135),
-            Belt(velocity, laws[1], 1.3878348, lower=-0.4312801),
-        )
-        return Oscillator(0.02107395, belts, 1.214963)
-
-    osc = package.oscillator(numbers(-0.7))
-    points = jb.scan(osc, lambda osc: osc.belts[1].velocity, (-0.73, -0.69))
-    kinds = [jb.SlidingExchange((0, 1)), jb.GrazingSliding(0)]
-    assert [point.condition for point in points] == kinds
-    assert points[0].value == -0.7094468 and 4e-6 < points[1].value - points[0].value < 5e-6
-    start, at = tuple(np.asarray(points[1].cycle.unknowns)[0, :2]), float(points[1].value)
-    sides = [engine.attractor(numbers(at + away), start) for away in (-1e-8, 1e-8)]
-    assert [side.kind for side in sides] == ["cycle", "equilibrium"]
