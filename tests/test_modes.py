@@ -216,17 +216,31 @@ def made(beside: bool, count: int):
     return lists.maker([oscillator(row, beside) for row in rows]), rows
 
 
+@functools.cache
+def from_all_starts(beside: bool, count: int, t1: float, observe):
+    """What the rows do from the starts of them all."""
+    make, rows = made(beside, count)
+    starts = {name: sorted({row.y[i] for row in rows}) for i, name in enumerate(("x1", "x2"))}
+    axes = {"case": np.arange(len(rows), dtype=float)} | starts
+    return jb.sweep(make, axes, t1=t1, observe=observe, progress=False)
+
+
 def by_sweep(osc: Oscillator, y, row: Row, beside: bool) -> Seen:
     make, rows = made(beside, len(osc.belts))
-    axes = {"case": [float(rows.index(row))], "x1": y[:1], "x2": y[1:]}
+    here = {"case": float(rows.index(row)), "x1": y[0], "x2": y[1]}
 
-    def mode_at(t1):
-        found = jb.sweep(make, axes, t1=t1, observe="final", progress=False)
-        return ints(found.mode_end.values.ravel())
+    def from_start(t1, observe):
+        return from_all_starts(beside, len(osc.belts), t1, observe).sel(here)
 
-    run = jb.sweep(make, axes, t1=LONG, observe=FIRST, progress=False)
-    t, kind, number = run["first"].values.ravel()
-    return Seen(mode_at(AT_ONCE), (EventKind(int(kind)), int(number)), mode_at(t + AT_ONCE))
+    t, kind, number = from_start(LONG, FIRST)["first"].values
+    after = jb.sweep(
+        make, {name: [at] for name, at in here.items()}, t1=t + AT_ONCE, progress=False
+    )
+    return Seen(
+        ints(from_start(AT_ONCE, "final").mode_end.values),
+        (EventKind(int(kind)), int(number)),
+        ints(after.mode_end.values.ravel()),
+    )
 
 
 def oscillator(row: Row, beside: bool) -> Oscillator:

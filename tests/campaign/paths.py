@@ -649,14 +649,6 @@ def _changes(case: Case) -> bool:
     return len(names) > 1
 
 
-def settings(options) -> dict:
-    return {}
-
-
-def numbers(options) -> range:
-    return range(options.runs)
-
-
 def outcome(options, number: int) -> Outcome:
     """Compare along one path."""
     case = case_of(options.seed, number)
@@ -680,7 +672,3 @@ def outcome(options, number: int) -> Outcome:
         undecided=report.undecided,
     )
     return one
-
-
-def said(counts, largest) -> list[str]:
-    return [f"{dict(counts)}"]
