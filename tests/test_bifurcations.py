@@ -276,6 +276,7 @@ def test_a_hopf_point_is_no_fold_of_cycles():
     assert "value nan, NO_FOLD: " in repr(point)
 
 
+@pytest.mark.slow(first=True)
 def test_convergence_is_quadratic():
     """Each Newton step is about the square of the one before, until rounding ends it."""
     point = jb.refine(jb.NonsmoothFold(0), jb.presets.class_a(0.28), where=nu0)
@@ -580,6 +581,7 @@ def test_growth_at_infinity_that_is_not_told():
     assert jb.scan(lambda d: one_belt(d, QUADRATIC), span=(-0.2, 0.15), resolution=8) == ()
 
 
+@pytest.mark.slow(first=True)
 def test_derivative_of_a_point_at_infinity():
     """Of the damping at which it happens by the quadratic coefficient, in closed form."""
 

@@ -213,6 +213,7 @@ def test_what_does_not_stick_again_in_time_is_nan(found):
 # --- relations ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(first=True)
 def test_a_force_of_the_other_sign_moves_the_phase_by_half_a_turn(found):
     other = jb.circle_map(bkn(-AMPLITUDE))
     # The cosines differ in the last bit, which slopes up to 1e4 make more of.

@@ -68,6 +68,7 @@ def errors(curve, osc, where, condition, rows):
     return found
 
 
+@pytest.mark.slow(first=True)
 def test_every_row_is_what_refine_finds(fold):
     rows = range(3, len(fold) - 3, len(fold) // 8)
     osc = jb.presets.class_b(-0.5, 0.35)
@@ -80,6 +81,7 @@ def steepness(osc):
     return osc.belts[0].friction.steepness
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(
     ("number", "where", "span", "step"),
     [
@@ -167,6 +169,7 @@ def test_folds_of_cycles_end_where_the_cycle_touches_a_boundary():
     assert curve.ends == (Stop.STOPPED, Stop.STOPPED)
 
 
+@pytest.mark.slow(first=True)
 def test_a_fold_becomes_grazing_where_both_belts_are_touched(fold):
     """At nu0 = -nu1 by symmetry; there the fold of one belt goes over into the grazing point."""
     double = fold.special[0]
@@ -227,6 +230,7 @@ def test_a_limit_at_a_belt_at_rest_whose_law_jumps():
     assert rest.values == pytest.approx((0.0, expected), abs=1e-11) and rest.residual < 1e-12
 
 
+@pytest.mark.slow(first=True)
 def test_a_table_has_rows_and_special_points_in_order(fold):
     columns = fold.table(("nu0", "nu1"))
     table = columns.to_dict("records")
@@ -244,6 +248,7 @@ def test_a_table_has_rows_and_special_points_in_order(fold):
     assert "belts[0].velocity" in fold.table()
 
 
+@pytest.mark.slow(first=True)
 def test_curves_have_the_symmetries_of_the_plane(points, fold):
     """The mirror image nu -> -nu, row by row; the belts exchanged, in the special points."""
     mirrored = jb.scan(jb.presets.class_b(0.3, -0.35), nu0, (0.5, 0.6))

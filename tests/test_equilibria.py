@@ -100,6 +100,7 @@ def check_fixed_point(points, i, x1, trace):
     assert points.stable[i, 0] == (trace < 0)
 
 
+@pytest.mark.slow(first=True)
 def test_fixed_point_of_class_a_is_that_of_the_paper():
     rng = np.random.default_rng(24)
     belts = draw_belts(rng, (200,))
@@ -549,6 +550,7 @@ def test_derivatives_of_the_ends_of_a_segment():
     assert np.asarray(gradient) == pytest.approx(np.array(expected), **EXACT)
 
 
+@pytest.mark.slow(first=True)
 def test_every_derivative_is_a_number_though_edges_are_infinite():
     osc = jb.presets.class_d(-0.5, 0.55, -0.4, 0.3)
     fixed = np.flatnonzero(jb.equilibria(osc).kind == FIXED_POINT)
@@ -657,6 +659,7 @@ class Cubic(jb.AbstractFriction):
         return self.static - speed + speed**3
 
 
+@pytest.mark.slow(first=True)
 def test_a_law_of_ones_own_and_a_supercritical_point():
     nu, half_trace = 0.3, 0.005
     zeta = 1 - 3 * nu**2 - 2 * half_trace
@@ -784,6 +787,7 @@ def test_where_runs_come_to_rest_is_told_though_others_are_near():
     assert bool((told.label == 0).all())
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("edges", [(0.3, 0.3), (0.3, 0.1 + 0.2), (0.1 + 0.2, 0.3)])
 def test_edges_that_differ_by_rounding_are_one(edges):
     """Around a pseudo-focus with pushes a and traces b of the sides, loops grow where the sum of

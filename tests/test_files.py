@@ -427,6 +427,7 @@ def test_simulate_in_si_units(tmp_path):
     assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow(first=True)
 def test_a_sweep_over_a_machine_is_a_loop_over_machines(tmp_path):
     """Also where the force varies that makes the unit of length; starts are in metres."""
     forces, starts, out = (10.0, 40.0), (0.0, 0.05), tmp_path / "sweep.nc"

@@ -291,6 +291,7 @@ def test_design_meets_an_amplitude_at_a_frequency():
     plan.plot()
 
 
+@pytest.mark.slow(first=True)
 def test_design_finds_the_frequency_of_the_closed_form():
     plan = jb.design(den_hartog(0.6), [(jb.amplitude, 2.0)], where=frequency_of)
     assert int(plan.status) == OK

@@ -359,7 +359,6 @@ def stick(cycle):
     return jb.stick_duration(cycle, 1)
 
 
-@pytest.mark.slow(first=True)
 def test_design_meets_a_stick_duration():
     told = []
     plan = jb.design(jb.presets.class_b(0.45, 0.35), [(stick, 0.5)], where=nu0, report=told.append)

@@ -43,8 +43,9 @@ def its_oracle():
 @pytest.fixture(scope="module")
 def run():
     m = machine()
-    times = m.tau(np.linspace(0.0, 0.5, 4001))
-    return jb.simulate(m.oscillator, m.start(0.003, 0.0), times[-1], ts=times)
+    # Of a shape that other tests ask for, too, see tests/test_relations.py.
+    times = m.tau(np.linspace(0.0, 0.5, 241))
+    return jb.simulate(m.oscillator, m.start(0.003, 0.0), times[-1], ts=times, max_segments=4096)
 
 
 def test_motion_in_si_is_that_of_the_dimensional_oracle(run):
@@ -67,7 +68,7 @@ def test_friction_force(run):
     ours = jb.in_si(run, machine())
     x, v = ours.x1.values, ours.x2.values
     stuck = (ours["mode"].values == 0).any(axis=1)
-    assert 500 < stuck.sum() < 3500
+    assert 30 < stuck.sum() < 210
     with pytest.raises(ValueError, match="result must be dimensionless, got a dataset that is in"):
         jb.in_si(ours, machine())
     # Nothing is accelerated where it sticks: the force is that of spring and dashpot.
@@ -614,6 +615,7 @@ def shaken(frequency):
     return jb.Machine(MASS, STIFFNESS, DAMPING, (sole,), forcing=force)
 
 
+@pytest.mark.slow(first=True)
 def test_a_forced_motion_in_si():
     m = shaken(60.0)
     motion = jb.find_cycle(m.oscillator, m.start(0.0, 0.0))

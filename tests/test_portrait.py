@@ -506,6 +506,7 @@ def test_a_belt_at_rest_without_load_changes_nothing():
     assert float(told.cycles[0].period) == period
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("edges", [(0.3, 0.3), (0.3, 0.1 + 0.2), (0.1 + 0.2, 0.3)])
 def test_a_saddle_on_edges_that_are_one_up_to_rounding_is_one(edges):
     law, (upper, lower) = jb.Conti(1.0, 0.6, 10.0), edges
@@ -551,6 +552,7 @@ def test_a_jump_of_the_map_of_tops_is_no_gap(law, damping, omega, belts):
     assert len(told.cycles) == 1 and not told.unstable
 
 
+@pytest.mark.slow(first=True)
 def test_loops_around_a_fixed_point_on_an_edge_grow_as_its_rate_says():
     """Next to it, where their growth is rounding: an excursion over the edge, of 4e-15, is twenty
     floats long."""

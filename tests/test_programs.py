@@ -208,6 +208,7 @@ print(compiling.jit(solve)(np.array([[2.0, 1.0], [1.0, 3.0]]), np.ones(2)).tolis
     assert len(files(folder)) == 1
 
 
+@pytest.mark.slow(first=True)
 def test_a_users_own_cache_of_jax_does_no_harm(folder, tmp_path):
     """A program that came out of JAX's cache could not be loaded again."""
     script = """

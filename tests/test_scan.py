@@ -127,6 +127,7 @@ def crossing():
     return jb.scan(held_by(0.3)[0], load1, (0.1, 0.5), resolution=48)
 
 
+@pytest.mark.slow(first=True)
 def test_crossing_sliding(crossing):
     """At the end of slip onset, where a phase of no duration begins, and at the other end."""
     assert [point.condition for point in crossing] == [jb.CrossingSliding(1)] * 2

@@ -177,6 +177,7 @@ def _edge_at_the_least_friction(v):
     return jb.Oscillator(0.5, (jb.Belt(v, conti), jb.Belt(0.5, conti, lower=edge)))
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("start", [0.26, 0.2999, 0.33])
 def test_the_error_of_a_double_root_is_told(start):
     osc = _edge_at_the_least_friction(start)

@@ -377,6 +377,7 @@ def test_a_lane_that_is_not_finite_harms_no_other():
         np.testing.assert_array_equal(getattr(hurt, name)[~lost], getattr(sound, name)[~lost])
 
 
+@pytest.mark.slow(first=True)
 def test_nor_does_one_of_the_switch_model():
     def run(nu):
         osc = jb.presets.class_b(nu, 0.35)
@@ -825,18 +826,12 @@ def test_no_samples_in_a_batch():
 #: the engine of the campaigns the number of events until 50 and the state there.
 THIN = [
     ((2.487, 0.475), 0.098, [(0.2328, 0.446)], 5, (0.2534408535373042, 0.04556610074149681)),
-    pytest.param(
-        *((-1.35, 0.0), 0.05, [(0.35, 1.0)], 15, (0.25506473732934754, 0.32444510417110334)),
-        marks=pytest.mark.slow(first=True),
-    ),
-    pytest.param(
-        *((3.0, 0.0), 0.2, [(-0.55, 1.5), (0.95, 2.0)]),
-        *(3, (0.2915785057334776, -0.0017051355186067396)),
-        marks=pytest.mark.slow(first=True),
-    ),
+    ((-1.35, 0.0), 0.05, [(0.35, 1.0)], 15, (0.25506473732934754, 0.32444510417110334)),
+    ((3.0, 0.0), 0.2, [(-0.55, 1.5), (0.95, 2.0)], 3, (0.2915785057334776, -0.0017051355186067396)),
 ]
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("y0, damping, belts, count, end", THIN)
 def test_a_thin_layer_is_neither_jumped_nor_left_late(y0, damping, belts, count, end):
     """On the way in the step that ends at the boundary has to see the layer; at slip onset an error

@@ -87,6 +87,7 @@ def test_the_fold_is_differentiable(point):
     assert slope == pytest.approx(float(difference), rel=1e-6)
 
 
+@pytest.mark.slow(first=True)
 def test_what_is_no_such_fold_is_refused(point):
     hopf = jb.refine(jb.Hopf(), jb.presets.class_a(0.19), where=nu0)
     with pytest.raises(ValueError, match="point must be a nonsmooth fold"):
