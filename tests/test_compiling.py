@@ -106,7 +106,7 @@ SIMULATE = jax.jit(lambda y0, ts: jb.simulate(CLASS_B, y0, 40.0, ts=ts))
 
 @pytest.mark.parametrize("end", [40.0, 39.0])
 def test_padded_times_are_those_that_were_asked_for(end):
-    ts = np.linspace(0.0, end, 37)
+    ts = np.linspace(0.0, end, 101)
     found = jb.simulate(CLASS_B, (3.0, 0.0), 40.0, ts=ts)
     # In a trace the times are not padded.
     unpadded = SIMULATE(np.array([3.0, 0.0]), ts)

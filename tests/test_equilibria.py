@@ -463,10 +463,9 @@ def test_derivatives_of_a_fixed_point_are_those_of_the_formulas():
             (mus - p1) * (1 / s**2 - 2 * p3 * nu / s**3) / 2,
         ],
     ]
-    for jacobian in (jax.jacfwd, jax.jacrev):
-        assert np.asarray(jax.jit(jacobian(position_and_rate))(jnp.array(p))) == pytest.approx(
-            np.array(expected), **EXACT
-        )
+    both = jax.jit(lambda p: [way(position_and_rate)(p) for way in (jax.jacfwd, jax.jacrev)])
+    for found in both(jnp.array(p)):
+        assert np.asarray(found) == pytest.approx(np.array(expected), **EXACT)
 
 
 @pytest.mark.slow(first=True)
@@ -787,23 +786,33 @@ def test_where_runs_come_to_rest_is_told_though_others_are_near():
     assert bool((told.label == 0).all())
 
 
-@pytest.mark.slow(first=True)
-@pytest.mark.parametrize("edges", [(0.3, 0.3), (0.3, 0.1 + 0.2), (0.1 + 0.2, 0.3)])
+#: One edge of each of two belts, but for rounding.
+edges_but_for_rounding = pytest.mark.parametrize(
+    "edges", [(0.3, 0.3), (0.3, 0.1 + 0.2), (0.1 + 0.2, 0.3)]
+)
+
+
+def with_edges(edges, damping):
+    upper, lower = edges
+    belts = jb.Belt(0.1, LAW, upper=upper), jb.Belt(-0.2, LAW, lower=lower)
+    return jb.Oscillator(damping, belts)
+
+
+@edges_but_for_rounding
 def test_edges_that_differ_by_rounding_are_one(edges):
+    rests = jb.equilibria(with_edges(edges, 0.5))
+    assert rests.kind.tolist() == [jb.EquilibriumKind.PSEUDO_FOCUS] and not rests.stable[0]
+
+
+@pytest.mark.slow(first=True)
+@edges_but_for_rounding
+def test_edges_that_differ_by_rounding_have_one_pseudo_hopf_point(edges):
     """Around a pseudo-focus with pushes a and traces b of the sides, loops grow where the sum of
     b/a is positive."""
-    upper, lower = edges
-
-    def make(damping):
-        return jb.Oscillator(
-            damping, (jb.Belt(0.1, LAW, upper=upper), jb.Belt(-0.2, LAW, lower=lower))
-        )
-
-    rests = jb.equilibria(make(0.5))
-    assert rests.kind.tolist() == [jb.EquilibriumKind.PSEUDO_FOCUS] and not rests.stable[0]
     left, right = 0.8 - 0.3, 0.6 + 0.4 / 3 + 0.3
     zero = (1 / left + 4 / 9 / right) / (1 / left + 1 / right)
-    assert float(jb.refine(jb.PseudoHopf(0), make, at=0.8).value) == pytest.approx(zero, abs=1e-13)
+    point = jb.refine(jb.PseudoHopf(0), lambda damping: with_edges(edges, damping), at=0.8)
+    assert float(point.value) == pytest.approx(zero, abs=1e-13)
 
 
 def test_what_a_belt_at_rest_holds_in_one_point_is_no_segment():
