@@ -1,6 +1,5 @@
 """Oscillators and machines from a file: what the Python classes are, and results in SI units."""
 
-import csv
 import functools
 import json
 import re
@@ -13,6 +12,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
+from test_cli import column, read
 from typer.testing import CliRunner
 
 import jaxbelt as jb
@@ -53,15 +53,6 @@ def described(folder, text) -> Any:
 
 def run(*words):
     return CliRunner().invoke(app, [*map(str, words)])
-
-
-def read(path):
-    with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
-def column(rows, name):
-    return np.array([float(row[name]) for row in rows])
 
 
 # --- what a file describes ----------------------------------------------------------------------
