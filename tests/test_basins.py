@@ -66,6 +66,13 @@ def test_one_attractor_alone_is_exact(velocity, exact):
     found = jb.basin_stability(belt_drive(velocity), box=BOX, n=2_000, key=jax.random.key(2))
     assert found.fractions["equilibrium"] == exact
     assert found.fractions["cycle"] == 1 - exact
+    if exact:
+        starts = {"x1": np.array([-1.0, 0.5, 2.0]), "x2": np.array([0.0, 1.0])}
+        grid = jb.basins(belt_drive(velocity), **starts, progress=False)
+        # x1 = mu(1.9) at rest
+        assert grid.attractors == (f"rest at {0.5 * (1 + np.exp(-3.8)):.3f}",)
+        assert np.all(np.asarray(grid.label) == 0)
+        assert grid.boundary.status == Status.NO_UNSTABLE_CYCLE
 
 
 def test_the_bound_is_told_where_all_starts_agree():
@@ -80,6 +87,7 @@ def test_the_bound_is_told_where_all_starts_agree():
     assert "equilibrium 0.25000 +- 0.01369, cycle 0.75000" in repr(stability(0.75, 1000))
 
 
+@pytest.mark.slow(first=True)
 def test_grid_is_split_by_the_unstable_cycle():
     x1, x2 = np.linspace(-1.0, 2.0, 41), np.linspace(-1.3, 1.7, 37)
     found = jb.basins(belt_drive(1.4), x1=x1, x2=x2, progress=False)

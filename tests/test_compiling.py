@@ -104,6 +104,7 @@ def test_numbers_decide_no_program(name):
 SIMULATE = jax.jit(lambda y0, ts: jb.simulate(CLASS_B, y0, 40.0, ts=ts))
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("end", [40.0, 39.0])
 def test_padded_times_are_those_that_were_asked_for(end):
     ts = np.linspace(0.0, end, 101)

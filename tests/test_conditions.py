@@ -64,6 +64,7 @@ def points():
     return jb.scan(osc, nu0, (0.09, 0.4), resolution=24, conditions=conditions)
 
 
+@pytest.mark.slow(first=True)
 def test_it_is_found_on_a_path_among_the_others(points, exact):
     """The period of 9 is not there: the belt would be slower."""
     kinds = [PeriodIs(8.0), jb.Hopf(), jb.NonsmoothFold(0)]
@@ -76,6 +77,7 @@ def test_it_is_looked_for_only_where_it_is_asked_for():
     assert points == ()
 
 
+@pytest.mark.slow(first=True)
 def test_its_curve_is_followed_and_drawn(points):
     span = ((0.05, 0.2), (0.2, 0.8))
     curve = jb.bifurcation_curve(points[0], (nu0, zeta), span, step=0.04)
@@ -96,6 +98,7 @@ def test_its_curve_is_followed_and_drawn(points):
     assert curve.table(("nu0", "zeta")).condition[0] == "PeriodIs"
 
 
+@pytest.mark.slow(first=True)
 def test_its_name_stands_in_diagrams(points):
     osc = jb.presets.class_a(0.2)
     diagram = jb.BifurcationDiagram(points, (), ((0.09, 0.4, "2"),), osc, "belts[0].velocity")

@@ -156,6 +156,7 @@ def test_unstable_cycle_is_that_of_the_oracle(name, velocities):
         assert getattr(cycle, extremum) == pytest.approx(getattr(expected, extremum), abs=1e-9)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("nu", [0.2, 0.6])
 def test_there_is_no_unstable_cycle_outside_of_hopf_point_and_fold(nu):
     cycle = jb.unstable_cycle(jb.presets.class_b(nu, 0.35))

@@ -650,6 +650,7 @@ def test_a_used_up_budget_gives_what_there_is():
     assert f"t 0 to 100000, known up to {known:.6g}, " in repr(run)
 
 
+@pytest.mark.slow(first=True)
 def test_a_run_without_samples_shows_its_events():
     run = simulate(jb.presets.class_b(-0.2, 0.35), (3.0, 0.0), SHORT, ts=[])
     assert repr(run).startswith("Trajectory(0 samples, Events(") and "status OK" in repr(run)

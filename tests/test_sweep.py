@@ -52,6 +52,7 @@ def test_the_dataset_is_labelled(dataset):
     assert "velocity of belt 0" in str(dataset.nu0.attrs) and "x1_end" in repr(dataset)
 
 
+@pytest.mark.slow(first=True)
 def test_axes_of_starts_and_of_functions_with_fixed_arguments(dataset):
     make = functools.partial(jb.presets.class_b, nu1=0.35)
     starts = jb.sweep(make, {"x1": [1.0, 3.0], "nu0": NU0}, t1=SPAN)
