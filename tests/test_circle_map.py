@@ -223,17 +223,15 @@ def test_a_force_of_the_other_sign_moves_the_phase_by_half_a_turn(found):
     np.testing.assert_allclose(moved, found.fixed_points, atol=1e-9)
 
 
+@pytest.mark.slow(first=True)
 def test_the_mirror_image_has_the_same_map_at_the_other_limit(found):
     mirrored = jb.circle_map(bkn(-AMPLITUDE, -1.0))
     assert (found.limit, mirrored.limit) == (-1, 1)
     same_maps(mirrored, found, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "units",
-    [pytest.param((2.0**-24, 2.0**3), marks=pytest.mark.slow(first=True)), (2.0**24, 2.0**-10)],
-    ids=str,
-)
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("units", [(2.0**-24, 2.0**3), (2.0**24, 2.0**-10)], ids=str)
 def test_the_map_does_not_depend_on_units(found, units):
     """Of powers of two it does not to the last bit; the motions come in the units given."""
     length, omega = units

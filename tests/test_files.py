@@ -394,6 +394,7 @@ def test_a_file_that_is_not_there(tmp_path):
 # --- results in SI units ------------------------------------------------------------------------
 
 
+@pytest.mark.slow(first=True)
 def test_simulate_in_si_units(tmp_path):
     out = tmp_path / "run"
     words = "--start", 0.05, 0, "--t1", END, "--samples", SAMPLES, "--json", "--out", out

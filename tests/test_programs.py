@@ -340,6 +340,7 @@ def test_the_least_recently_used_go(folder, monkeypatch):
     assert sum(one.size for one in programs.entries()) <= programs.BOUND
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.skipif(sys.platform == "win32", reason="processes are forked")
 def test_processes_killed_at_random_leave_nothing_wrong(tmp_path):
     assert campaign(tmp_path, kills=12, seed=0)
