@@ -4,6 +4,7 @@ import ctypes
 import gc
 import os
 import random
+import sys
 import time
 from pathlib import Path
 
@@ -71,6 +72,14 @@ def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> 
             # What is free goes back to the system only when glibc is asked for that.
             if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
                 trim(0)
+
+
+@pytest.fixture(autouse=True)
+def close_figures():
+    """A test leaves no figure open."""
+    yield
+    if pyplot := sys.modules.get("matplotlib.pyplot"):
+        pyplot.close("all")
 
 
 def pytest_configure(config: pytest.Config) -> None:

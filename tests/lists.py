@@ -15,9 +15,10 @@ import numpy as np
 import jaxbelt as jb
 
 
-def swept(oscillators: Sequence[jb.Oscillator], axes: dict[str, Any] | None = None, **options):
-    """`jb.sweep` over the oscillators, axis `case`, and over further axes."""
-    # One more, left out of the result: the program for contact edges serves those without, too.
+def maker(oscillators: Sequence[jb.Oscillator]):
+    """The function of a number `case` that makes the oscillator of this number, all numbers
+    data. One more than there are oscillators is made, the first with an edge: the program for
+    contact edges serves those without, too."""
     edged = eqx.tree_at(lambda osc: osc.belts[0].upper, oscillators[0], jnp.asarray(50.0))
     structure = jax.tree.structure(edged)
     columns = [
@@ -29,6 +30,11 @@ def swept(oscillators: Sequence[jb.Oscillator], axes: dict[str, Any] | None = No
         which = jnp.asarray(case).astype(int)
         return jax.tree.unflatten(structure, [jnp.asarray(column)[which] for column in columns])
 
-    cases = np.arange(len(columns[0]), dtype=float)
-    found = jb.sweep(make, {"case": cases} | (axes or {}), progress=False, **options)
+    return make
+
+
+def swept(oscillators: Sequence[jb.Oscillator], axes: dict[str, Any] | None = None, **options):
+    """`jb.sweep` over the oscillators, axis `case`, and over further axes."""
+    cases = np.arange(len(oscillators) + 1, dtype=float)
+    found = jb.sweep(maker(oscillators), {"case": cases} | (axes or {}), progress=False, **options)
     return found if "case" in (axes or {}) else found.isel(case=slice(len(oscillators)))

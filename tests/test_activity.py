@@ -98,7 +98,9 @@ search()
 """
 
 
-@pytest.mark.parametrize("on_terminal", [True, False])
+@pytest.mark.parametrize(
+    "on_terminal", [True, pytest.param(False, marks=pytest.mark.slow(first=True))]
+)
 def test_a_terminal_sees_what_takes_longer_than_two_seconds_and_a_pipe_does_not(on_terminal):
     ends = pty.openpty() if on_terminal else os.pipe()
     with os.fdopen(ends[0], "rb", buffering=0) as here:

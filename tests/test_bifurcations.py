@@ -9,13 +9,12 @@ import pytest
 from laws import BELL, bell, peak
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
+from where import nu0
 
 import jaxbelt as jb
 from jaxbelt import Status
 
-
-def nu0(osc):
-    return osc.belts[0].velocity
+FIRST = pytest.mark.slow(first=True)
 
 
 def class_b(nu):
@@ -171,10 +170,10 @@ def test_a_law_with_a_jump():
 @pytest.mark.parametrize(
     ("condition", "nu", "status"),
     [
-        (jb.GrazingSliding(0), 0.52, Status.NOT_TOUCHED),
+        pytest.param(jb.GrazingSliding(0), 0.52, Status.NOT_TOUCHED, marks=FIRST),
         (jb.GrazingSliding(1), 0.52, Status.OTHER_KIND),
-        (jb.NonsmoothFold(0), -0.45, Status.OTHER_KIND),
-        (jb.SlidingExchange((0, 1)), 0.6, Status.NOT_TOUCHED),
+        pytest.param(jb.NonsmoothFold(0), -0.45, Status.OTHER_KIND, marks=FIRST),
+        pytest.param(jb.SlidingExchange((0, 1)), 0.6, Status.NOT_TOUCHED, marks=FIRST),
         (jb.SuddenSliding(1), 0.3, Status.NO_CONVERGENCE),
     ],
 )
@@ -186,7 +185,9 @@ def test_a_guess_that_fits_no_such_point_is_told_so(condition, nu, status):
     assert "jb.scan with a span" in repr(point)
 
 
-@pytest.mark.parametrize("offset", [-0.03, -0.004, 0.004, 0.03])
+@pytest.mark.parametrize(
+    "offset", [-0.03, *(pytest.param(d, marks=FIRST) for d in (-0.004, 0.004)), 0.03]
+)
 def test_a_fold_from_where_newtons_method_alone_does_not_find_it(offset):
     law = jb.Conti(1.0, 0.6, 10.0)
 
@@ -205,7 +206,9 @@ def test_a_fold_from_where_newtons_method_alone_does_not_find_it(offset):
     assert abs(point.value - expected) <= point.error + 1e-11
 
 
-@pytest.mark.parametrize("offset", [-0.03, -1e-3, 1e-3, 0.03])
+@pytest.mark.parametrize(
+    "offset", [-0.03, *(pytest.param(d, marks=FIRST) for d in (-1e-3, 1e-3)), 0.03]
+)
 def test_grazing_from_where_newtons_method_alone_does_not_find_it(offset):
     """A thousandth from where belt 0 is at rest, beyond which there is no such cycle."""
 
@@ -273,6 +276,7 @@ def test_a_hopf_point_is_no_fold_of_cycles():
     assert "value nan, NO_FOLD: " in repr(point)
 
 
+@pytest.mark.slow(first=True)
 def test_convergence_is_quadratic():
     """Each Newton step is about the square of the one before, until rounding ends it."""
     point = jb.refine(jb.NonsmoothFold(0), jb.presets.class_a(0.28), where=nu0)
@@ -463,3 +467,127 @@ def test_a_fold_of_a_law_with_a_narrow_layer(scale):
     point = jb.refine(jb.NonsmoothFold(0), make, at=0.266)
     assert point.status == Status.OK
     assert point.value == pytest.approx(value, abs=1e-9)
+
+
+# --- cycles that come from infinity: by the energy of large loops ---------------------------------
+
+
+PAPER = jb.Conti(1.0, 0.6, 10.0)
+QUADRATIC = jb.Conti(1.0, 0.6, 10.0, 0.05)
+AT_INFINITY = jb.HopfAtInfinity()
+
+
+class Viscous(jb.AbstractFriction):
+    """mu(r) = static + slope r."""
+
+    static: float
+    slope: float
+
+    def mu(self, speed):
+        """Kinetic friction coefficient."""
+        return self.static + self.slope * speed
+
+
+class Root(jb.AbstractFriction):
+    """mu(r) = static + slope sqrt(1 + r)."""
+
+    static: float
+    slope: float
+
+    def mu(self, speed):
+        """Kinetic friction coefficient."""
+        return self.static + self.slope * (jnp.sqrt(1 + speed) - 1)
+
+
+def one_belt(damping, law=PAPER, omega=1.0, **changes):
+    return jb.Oscillator(damping, (jb.Belt(0.3, law, **changes),), omega=omega)
+
+
+@FIRST
+def test_a_cycle_comes_from_infinity_without_damping():
+    point = jb.refine(AT_INFINITY, one_belt, at=-0.1)
+    assert point.status == Status.OK and point.value == 0
+    assert point.cycle.status == Status.NOT_FINITE
+    (found,) = jb.scan(one_belt, span=(-0.2, 0.15), resolution=8)
+    assert found.condition == AT_INFINITY and found.value == 0
+    assert jb.scan(one_belt, span=(0.02, 0.15), resolution=8) == ()
+
+
+@pytest.mark.parametrize(
+    ("law", "omega", "changes", "at"),
+    [
+        # Energy of a loop x2 = A cos t: of a belt that is passed at |x2| = A, twice.
+        (
+            jb.Conti(1.0, 0.6, 10.0, 0.05),
+            1.0,
+            {"lower": -1.0, "upper": 1.5},
+            -2 / np.pi * 0.05 * 2.5,
+        ),
+        pytest.param(
+            jb.Conti(1.0, 0.6, 10.0, 0.05),
+            0.5,
+            {"lower": 0.0, "upper": 2.0},
+            -2 / np.pi * 0.0125 * 2,
+            marks=FIRST,
+        ),
+        pytest.param(*(Viscous(1.0, 0.02), 1.0, {"load": 2.0}, -0.04), marks=pytest.mark.slow),
+        pytest.param(*(Viscous(1.0, 0.02), 0.5, {"lower": 0.4}, -0.005), marks=pytest.mark.slow),
+        pytest.param(
+            *(Viscous(1.0, 0.02), 1.0, {"lower": 0.4, "upper": 2.0}, 0.0), marks=pytest.mark.slow
+        ),
+    ],
+)
+def test_a_cycle_comes_from_infinity_with_friction_that_grows(law, omega, changes, at):
+    def make(damping):
+        return one_belt(damping, law, omega, **changes)
+
+    point = jb.refine(AT_INFINITY, make, at=-0.1)
+    assert point.status == Status.OK and point.value == pytest.approx(at, abs=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("changes", "amplitude"),
+    [
+        # Twice the friction force, both ways, over pi times the damping.
+        ({}, lambda away: 4 * 0.6 / (np.pi * away)),
+        ({"lower": 0.4}, lambda away: 2 * 0.6 / (np.pi * away)),
+        # The remainder of the energy of a short contact, 2 u0 p1 times its length.
+        ({"lower": -0.5, "upper": 1.0}, lambda away: np.sqrt(2 * 1.5 * 0.6 / (np.pi * away))),
+    ],
+)
+def test_the_amplitude_of_what_comes_from_infinity_goes_there(changes, amplitude):
+    for away, error in ((0.01, 0.05), (0.0025, 0.02)):
+        portrait = jb.portrait(one_belt(-away, **changes))
+        outermost = max(portrait.unstable, key=jb.amplitude)
+        assert jb.amplitude(outermost) == pytest.approx(amplitude(away), rel=error)
+    assert jb.portrait(one_belt(0.0025, **changes)).unstable == ()
+
+
+@FIRST
+def test_nothing_comes_from_infinity():
+    """Friction that grows without bounds, as r^2 and to all sides; and none at all."""
+    point = jb.refine(AT_INFINITY, lambda damping: one_belt(damping, QUADRATIC), at=-0.1)
+    assert point.status != Status.OK and jnp.isnan(point.value)
+    point = jb.refine(AT_INFINITY, lambda damping: one_belt(damping, load=0.0), at=-0.1)
+    assert point.status == Status.NOT_TOUCHED
+
+
+@pytest.mark.slow
+def test_growth_at_infinity_that_is_not_told():
+    """What grows neither as r nor as r^2; and a scan where nothing comes from infinity."""
+    point = jb.refine(AT_INFINITY, lambda damping: one_belt(damping, Root(1.0, 0.1)), at=-0.1)
+    assert point.status == Status.NOT_TOUCHED
+    assert jb.scan(lambda d: one_belt(d, QUADRATIC), span=(-0.2, 0.15), resolution=8) == ()
+
+
+@pytest.mark.slow(first=True)
+def test_derivative_of_a_point_at_infinity():
+    """Of the damping at which it happens by the quadratic coefficient, in closed form."""
+
+    def value(p2):
+        law = jb.Conti(1.0, 0.6, 10.0, p2)
+        make = lambda damping: one_belt(damping, law, lower=-1.0, upper=1.5)  # noqa: E731
+        return jb.refine(AT_INFINITY, make, at=-0.1).value
+
+    assert jax.grad(value)(0.05) == pytest.approx(-5 / np.pi, abs=1e-9)

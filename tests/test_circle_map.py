@@ -1,7 +1,6 @@
 """`circle_map` against `find_cycle`, runs of SciPy and of `simulate`, closed forms, relations that
 must hold, and the engine of tests/campaign/forced.py."""
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -198,7 +197,6 @@ def test_where_needed_comes_back_from_the_limit_there_is_no_onset():
     assert np.array_equal(table.is_onset[~table.fixed_point], leaves)
     (patch,) = strong.plot().collections
     assert patch.get_label() == "no onset"
-    plt.close("all")
 
 
 def test_what_does_not_stick_again_in_time_is_nan(found):
@@ -215,6 +213,7 @@ def test_what_does_not_stick_again_in_time_is_nan(found):
 # --- relations ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(first=True)
 def test_a_force_of_the_other_sign_moves_the_phase_by_half_a_turn(found):
     other = jb.circle_map(bkn(-AMPLITUDE))
     # The cosines differ in the last bit, which slopes up to 1e4 make more of.
@@ -224,17 +223,15 @@ def test_a_force_of_the_other_sign_moves_the_phase_by_half_a_turn(found):
     np.testing.assert_allclose(moved, found.fixed_points, atol=1e-9)
 
 
+@pytest.mark.slow(first=True)
 def test_the_mirror_image_has_the_same_map_at_the_other_limit(found):
     mirrored = jb.circle_map(bkn(-AMPLITUDE, -1.0))
     assert (found.limit, mirrored.limit) == (-1, 1)
     same_maps(mirrored, found, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "units",
-    [pytest.param((2.0**-24, 2.0**3), marks=pytest.mark.slow(first=True)), (2.0**24, 2.0**-10)],
-    ids=str,
-)
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("units", [(2.0**-24, 2.0**3), (2.0**24, 2.0**-10)], ids=str)
 def test_the_map_does_not_depend_on_units(found, units):
     """Of powers of two it does not to the last bit; the motions come in the units given."""
     length, omega = units
@@ -271,7 +268,6 @@ def test_the_picture_has_gaps_where_the_map_jumps(found):
     assert stable.get_markerfacecolor() == "black" and unstable.get_markerfacecolor() == "white"
     assert len(stable.get_xdata()) == 1 and len(unstable.get_xdata()) == len(found.motions) - 1
     assert [text.get_text() for text in ax.get_xticklabels()][2] == r"$\pi$"
-    plt.close("all")
 
 
 @pytest.mark.parametrize(

@@ -27,8 +27,8 @@ from jaxbelt.tables import table_of
 
 runner = CliRunner()
 
-#: Every run of these tests has one shape, and so one compiled program.
-SPAN, TIMES = "--t1 50 --samples 401", np.arange(401) * 50.0 / 400
+#: Every run of these tests has one shape, and so one compiled program, that of test_compiling.py.
+SPAN, TIMES = "--t1 50 --samples 101", np.arange(101) * 50.0 / 100
 
 
 def read(path):
@@ -260,7 +260,7 @@ def test_a_run_that_is_cut_short_is_written_and_exits_with_1(tmp_path, monkeypat
     def cut_short(*args, **kwargs):
         trajectory = whole(*args, **kwargs)
         status = jnp.asarray(jb.Status.TOO_MANY_SEGMENTS.value)
-        ys = trajectory.ys.at[200:].set(jnp.nan)
+        ys = trajectory.ys.at[50:].set(jnp.nan)
         return eqx.tree_at(lambda run: (run.status, run.ys), trajectory, (status, ys))
 
     monkeypatch.setattr(jb, "simulate", cut_short)
@@ -269,8 +269,7 @@ def test_a_run_that_is_cut_short_is_written_and_exits_with_1(tmp_path, monkeypat
     assert result.exit_code == 1
     assert "TOO_MANY_SEGMENTS" in result.output
     assert (
-        np.isfinite(column(read(tmp_path / "run.csv"), "x1")).tolist()
-        == [True] * 200 + [False] * 201
+        np.isfinite(column(read(tmp_path / "run.csv"), "x1")).tolist() == [True] * 50 + [False] * 51
     )
 
 
@@ -373,6 +372,7 @@ def test_reproduce_writes_the_table_and_every_figure(reproduced, values):
     assert written == reproduce.table_as_json(values)
 
 
+@pytest.mark.slow(first=True)
 def test_critical_values_json(values):
     rows = json.loads(json.dumps(reproduce.table_as_json(values)))
     keys = ["class", "point", "kind", "printed", "computed", "residual", "iterations"]

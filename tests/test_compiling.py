@@ -1,8 +1,10 @@
 """How functions are compiled: the same results in and out of traces, and nothing needlessly."""
 
-import functools
 import os
+import subprocess
+import sys
 import threading
+from pathlib import Path
 
 import equinox.internal
 import jax
@@ -85,12 +87,9 @@ SAME_PROGRAM = {
 CLASS_B, OTHER = jb.presets.class_b(0.45, 0.35), jb.presets.class_b(0.41, 0.3)
 
 
-ALONG_NU0 = functools.partial(jb.presets.class_b, nu1=0.35)
-
-
 def swept(count, y0):
-    axes = {"nu0": np.linspace(0.1, 0.1 * count, count)}
-    return jb.sweep(ALONG_NU0, axes, y0=y0, t1=20.0 + count, observe="final")
+    axes = {"nu0": np.linspace(0.1, 0.1 * count, count), "nu1": [0.35]}
+    return jb.sweep(jb.presets.class_b, axes, y0=y0, t1=20.0 + count, observe="final")
 
 
 @pytest.mark.parametrize("name", SAME_PROGRAM)
@@ -102,12 +101,16 @@ def test_numbers_decide_no_program(name):
     assert compiled == []
 
 
+SIMULATE = jax.jit(lambda y0, ts: jb.simulate(CLASS_B, y0, 40.0, ts=ts))
+
+
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("end", [40.0, 39.0])
 def test_padded_times_are_those_that_were_asked_for(end):
-    ts = np.linspace(0.0, end, 37)
+    ts = np.linspace(0.0, end, 101)
     found = jb.simulate(CLASS_B, (3.0, 0.0), 40.0, ts=ts)
     # In a trace the times are not padded.
-    unpadded = jax.jit(lambda y0: jb.simulate(CLASS_B, y0, 40.0, ts=ts))(np.array([3.0, 0.0]))
+    unpadded = SIMULATE(np.array([3.0, 0.0]), ts)
     np.testing.assert_array_equal(found.ts, ts)
     # Samples are flown from one to the next, in pieces that may begin at other ones.
     np.testing.assert_allclose(found.ys, unpadded.ys, rtol=0, atol=1e-9)
@@ -456,3 +459,46 @@ def test_what_is_tried_inside_of_a_batch_is_no_part_of_it(trace, monkeypatch):
     product = compiling.with_batches(lambda x: 2 * x, lambda one, size, batched, x: 2 * x)
     assert trace(product)(jnp.ones(3)).tolist() == [2.0, 2.0, 2.0]
     assert compiling._works and all(compiling._works.values())
+
+
+# --- all without what is not promised -------------------------------------------------------------
+
+
+#: One of everything that leans on it: motion, cycles, sweeps, parameters, processes.
+PART = (
+    "test_compiling.py::test_jit_works_inside_of_every_trace",
+    "test_compiling.py::test_a_batch_gives_what_a_loop_gives",
+    "test_simulate.py::test_error_falls_with_the_tolerance",
+    "test_cycles.py::test_sticking_cycle_is_that_of_the_oracle",
+    "test_sweep.py::test_audits_find_nothing[final]",
+    "test_variations.py::test_hopf_points_in_closed_form[half]",
+    "test_processes.py::test_a_forked_child_is_told_to_be_spawned",
+)
+#: More of the same.
+MORE = (
+    "test_sweep.py::test_audits_find_nothing[attractor]",
+    "test_variations.py::test_hopf_points_in_closed_form",
+    "test_processes.py::test_a_spawned_child_computes",
+    "test_processes.py::test_a_child_that_was_forked_before_jax_was_used_computes",
+)
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        pytest.param(PART, marks=pytest.mark.slow(first=True)),
+        pytest.param(MORE, marks=pytest.mark.slow),
+    ],
+)
+def test_a_part_of_the_tests_passes_plainly(part):
+    tests = Path(__file__).parent
+    inherited = {k: v for k, v in os.environ.items() if not k.startswith("PYTEST_")}
+    run = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-n0", *(str(tests / one) for one in part)],
+        cwd=tests.parent,
+        env={**inherited, "JAXBELT_PLAIN": "1"},
+        capture_output=True,
+        text=True,
+        timeout=900,
+    )
+    assert run.returncode == 0, run.stdout

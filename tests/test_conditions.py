@@ -4,13 +4,13 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 import oracle
 import oracle_cycles
 import pytest
 from compilations import compilations
 from scipy.optimize import brentq
+from where import nu0, zeta
 
 import jaxbelt as jb
 from jaxbelt import Status
@@ -32,14 +32,6 @@ class PeriodIs(CycleEquation):
     def watch(self, osc, chain, z, slope):
         # Where its motion is 0.45 wide.
         return {("Width", ()): jnp.max(z[:, 0]) - jnp.min(z[:, 0]) - 0.45}
-
-
-def nu0(osc):
-    return osc.belts[0].velocity
-
-
-def zeta(osc):
-    return osc.damping
 
 
 def its_cycle(nu, damping=0.5):
@@ -72,6 +64,7 @@ def points():
     return jb.scan(osc, nu0, (0.09, 0.4), resolution=24, conditions=conditions)
 
 
+@pytest.mark.slow(first=True)
 def test_it_is_found_on_a_path_among_the_others(points, exact):
     """The period of 9 is not there: the belt would be slower."""
     kinds = [PeriodIs(8.0), jb.Hopf(), jb.NonsmoothFold(0)]
@@ -84,6 +77,7 @@ def test_it_is_looked_for_only_where_it_is_asked_for():
     assert points == ()
 
 
+@pytest.mark.slow(first=True)
 def test_its_curve_is_followed_and_drawn(points):
     span = ((0.05, 0.2), (0.2, 0.8))
     curve = jb.bifurcation_curve(points[0], (nu0, zeta), span, step=0.04)
@@ -102,15 +96,14 @@ def test_its_curve_is_followed_and_drawn(points):
     (line, *_) = curve.plot().lines
     assert line.get_label() == "period" and line.get_color() == "#0072B2"
     assert curve.table(("nu0", "zeta")).condition[0] == "PeriodIs"
-    plt.close("all")
 
 
+@pytest.mark.slow(first=True)
 def test_its_name_stands_in_diagrams(points):
     osc = jb.presets.class_a(0.2)
     diagram = jb.BifurcationDiagram(points, (), ((0.09, 0.4, "2"),), osc, "belts[0].velocity")
     texts = {text.get_text() for text in diagram.plot().texts}
     assert {"period", "Hopf", "nonsmooth fold, belt 0"} <= texts
-    plt.close("all")
 
 
 @pytest.mark.slow(first=True)

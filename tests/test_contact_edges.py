@@ -10,6 +10,7 @@ import oracle_cycles
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
+from where import nu0, nu1
 
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
@@ -17,14 +18,6 @@ from jaxbelt.bifurcations.path import ParameterPath
 from jaxbelt.numerics.continuation import Stop
 
 EDGE = EventKind.EDGE
-
-
-def nu0(osc):
-    return osc.belts[0].velocity
-
-
-def nu1(osc):
-    return osc.belts[1].velocity
 
 
 def sigma1(osc):
@@ -440,6 +433,7 @@ def test_a_fixed_point_comes_to_an_edge_on_which_a_segment_ends_all_along(mirror
     np.testing.assert_allclose(loads * (0.6 + 0.4 / (1 + 10 * speeds)), 0.25, atol=1e-12)
 
 
+@pytest.mark.slow(first=True)
 def test_the_end_of_a_segment_on_an_edge():
     """Belt 1 at rest holds what is within its capacity of the pull of belt 0."""
     osc = jb.presets.class_d(0.35, 0.0, 0.0, 0.6)
@@ -583,6 +577,7 @@ def test_a_segment_of_no_length_at_an_edge_does_not_hold():
     assert jb.simulate(make(-0.9), (3.0, 0.0), 60.0).status == jb.Status.STUCK_FOREVER
 
 
+@pytest.mark.slow(first=True)
 def test_where_one_type_of_boundary_equilibrium_turns_into_the_other():
     """Belt 0 pulls with 0.7 on the left of the edge, belt 1 with 0.9 mu(nu1) on the right, which is
     0.7 where 1 + 10 nu1 = 2.25."""
@@ -630,6 +625,7 @@ def test_the_kinetic_end_of_a_segment_comes_to_an_edge(velocity, kind):
     assert float(again.value) == pytest.approx(0.25, abs=1e-12)
 
 
+@pytest.mark.slow(first=True)
 def test_where_the_mass_is_pushed_back_nothing_ends_at_the_kinetic_limit():
     def make(edge):
         belts = (

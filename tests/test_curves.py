@@ -10,6 +10,7 @@ import oracle_cycles
 import pytest
 from laws import BELL, bell
 from scipy.optimize import brentq
+from where import nu0, nu1, zeta
 
 import jaxbelt as jb
 from jaxbelt.bifurcations.systems import Seen
@@ -19,15 +20,6 @@ from jaxbelt.model.parameters import leaf_index
 from jaxbelt.model.variations import Variation
 from jaxbelt.numerics.continuation import Corrected, CurvePoint, Stop
 from tests.campaign import engine
-
-
-def nu0(osc):
-    return osc.belts[0].velocity
-
-
-def nu1(osc):
-    return osc.belts[1].velocity
-
 
 PLANE = ((-0.7, 0.7), (-0.7, 0.7))
 
@@ -76,6 +68,7 @@ def errors(curve, osc, where, condition, rows):
     return found
 
 
+@pytest.mark.slow(first=True)
 def test_every_row_is_what_refine_finds(fold):
     rows = range(3, len(fold) - 3, len(fold) // 8)
     osc = jb.presets.class_b(-0.5, 0.35)
@@ -84,14 +77,11 @@ def test_every_row_is_what_refine_finds(fold):
     assert np.max(fold.residual) < 1e-12 and np.all(np.isfinite(fold.values))
 
 
-def zeta(osc):
-    return osc.damping
-
-
 def steepness(osc):
     return osc.belts[0].friction.steepness
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(
     ("number", "where", "span", "step"),
     [
@@ -179,6 +169,7 @@ def test_folds_of_cycles_end_where_the_cycle_touches_a_boundary():
     assert curve.ends == (Stop.STOPPED, Stop.STOPPED)
 
 
+@pytest.mark.slow(first=True)
 def test_a_fold_becomes_grazing_where_both_belts_are_touched(fold):
     """At nu0 = -nu1 by symmetry; there the fold of one belt goes over into the grazing point."""
     double = fold.special[0]
@@ -239,6 +230,7 @@ def test_a_limit_at_a_belt_at_rest_whose_law_jumps():
     assert rest.values == pytest.approx((0.0, expected), abs=1e-11) and rest.residual < 1e-12
 
 
+@pytest.mark.slow(first=True)
 def test_a_table_has_rows_and_special_points_in_order(fold):
     columns = fold.table(("nu0", "nu1"))
     table = columns.to_dict("records")
@@ -256,6 +248,7 @@ def test_a_table_has_rows_and_special_points_in_order(fold):
     assert "belts[0].velocity" in fold.table()
 
 
+@pytest.mark.slow(first=True)
 def test_curves_have_the_symmetries_of_the_plane(points, fold):
     """The mirror image nu -> -nu, row by row; the belts exchanged, in the special points."""
     mirrored = jb.scan(jb.presets.class_b(0.3, -0.35), nu0, (0.5, 0.6))
@@ -475,8 +468,8 @@ def test_a_point_where_the_cycle_passes_an_edge_in_two_corners_is_told_along_all
         return jb.presets.class_c(nu0, nu1, -0.5)
 
     found = []
-    for nu1, guess in ((-0.2343, 0.255), (-0.2383, 0.235), (-0.2322, 0.23), (-0.2291, 0.23)):
-        point = jb.refine(jb.CornerCollision(0), functools.partial(make, nu1=nu1), at=guess)
+    for velocity, guess in ((-0.2343, 0.255), (-0.2383, 0.235), (-0.2322, 0.23), (-0.2291, 0.23)):
+        point = jb.refine(jb.CornerCollision(0), functools.partial(make, nu1=velocity), at=guess)
         curve = jb.bifurcation_curve(point, make, ((0.225, 0.26), (-0.25, -0.22)))
         (double,) = curve.special
         assert double.kind == "DoubleSliding" and double.residual < 1e-12

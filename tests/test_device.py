@@ -238,7 +238,7 @@ first = pytest.mark.slow(first=True)
 @pytest.mark.parametrize(
     "computed",
     [
-        pytest.param(lambda: sweep(make=one_belt), id="sweep"),
+        pytest.param(lambda: sweep(make=one_belt), id="sweep", marks=first),
         pytest.param(lambda: sweep(derivatives=("nu0", "nu1")), id="derivatives", marks=first),
         pytest.param(lambda: sweep("attractor", class_d), id="attractors", marks=first),
         pytest.param(ends, id="ends", marks=first),

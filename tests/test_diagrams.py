@@ -3,11 +3,11 @@
 import dataclasses
 import functools
 
-import matplotlib.pyplot as plt
 import numpy as np
 import oracle
 import oracle_cycles
 import pytest
+from where import nu0
 
 import jaxbelt as jb
 from jaxbelt import EventKind
@@ -17,10 +17,6 @@ from jaxbelt.bifurcations.labels import Label
 from jaxbelt.bifurcations.pieces import Branch
 from jaxbelt.bifurcations.regions import RegionMap
 from jaxbelt.plotting.diagrams import _between_rows
-
-
-def nu0(osc):
-    return osc.belts[0].velocity
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +125,6 @@ def test_picture(diagram):
         diagram.plot(quantity="x3")
     with pytest.raises(ValueError, match=r"one number, got one that returns float64\[2\]"):
         diagram.plot(quantity=lambda cycle: cycle.stick_durations)
-    plt.close("all")
 
 
 def heights(ax, label):
@@ -160,7 +155,6 @@ def test_picture_of_any_functional(diagram):
     assert own.get_ylabel() == "quantity" and named.get_ylabel() == "period $T$"
     sticks = diagram.plot(quantity=functools.partial(jb.stick_duration, belt=1))
     assert sticks.get_ylabel() == "stick duration (belt 1)"
-    plt.close("all")
 
 
 def test_amplitude_is_drawn_where_x2_would_be_the_velocity_of_the_belt(diagram):
@@ -180,7 +174,6 @@ def test_amplitude_is_drawn_where_x2_would_be_the_velocity_of_the_belt(diagram):
     rests = [branch for branch in diagram.branches if branch.kind == "equilibrium"]
     only = dataclasses.replace(diagram, branches=tuple(rests))
     assert only.plot().get_ylabel() == "displacement $x_1$"
-    plt.close("all")
 
 
 def test_table_has_every_row_and_point(diagram):
@@ -222,7 +215,6 @@ def test_names_of_regions_stand_in_the_plane_of_the_paper_only(diagram):
     assert not in_plane_of_paper([jb.Oscillator(0.5, [jb.Belt(v, law) for v in (0.1, 0.2, 0.3)])])
     elsewhere = dataclasses.replace(diagram, as_paper=False)
     assert not {"6", "4a", "2b"} & {text.get_text() for text in elsewhere.plot().texts}
-    plt.close("all")
 
 
 def test_picture_shows_stick_velocities_and_dashes_what_is_unstable(diagram):
@@ -264,7 +256,6 @@ def cells():
     return jb.region_map(jb.presets.class_b, {"nu0": NU0S, "nu1": NU1S}, lines=0)
 
 
-@pytest.mark.slow(first=True)
 def test_cells_are_named_as_the_oracle_finds(cells):
     rng = np.random.default_rng(7)
     for i, j in zip(rng.integers(0, 12, 14), rng.integers(0, 11, 14), strict=True):
@@ -272,6 +263,8 @@ def test_cells_are_named_as_the_oracle_finds(cells):
     # Those of the paper, and 4a, 4b, 5a beside them.
     assert set(cells.regions) >= {"1", "2a", "2b", "3a", "3b", "4a", "4b", "4c", "6"}
     assert cells.curves == () and "12 x 11 cells" in repr(cells)
+    # None lies on the line of a belt at rest.
+    assert not np.any(cells.on_line) and cells.between == ()
 
 
 @pytest.mark.slow(first=True)
@@ -329,7 +322,7 @@ def test_a_gap_in_the_curves_leaves_it_to_the_nearest_cell():
     }
 
 
-def test_a_cell_on_the_line_of_a_belt_at_rest_is_not_an_area(cells):
+def test_a_cell_on_the_line_of_a_belt_at_rest_is_not_an_area():
     """There the mass stays: the cell's name is right on that line, and wrong on both its sides."""
     nus = np.array([-0.2, 0.0, 0.2])
     label = np.array([["3b", "1", "4c"], ["1", "1", "1"], ["4c", "1", "3a"]])
@@ -337,8 +330,6 @@ def test_a_cell_on_the_line_of_a_belt_at_rest_is_not_an_area(cells):
     axes = (nus, nus)
     made = RegionMap(("nu0", "nu1"), axes, label, (), {}, on_line, (), jb.presets.class_b)
     assert set(np.unique(made.raster())) == {"3b", "4c", "3a"} and made.as_paper
-    # No cell of the others lies on such a line.
-    assert not np.any(cells.on_line) and cells.between == ()
 
 
 def test_impossible_axes_are_named():

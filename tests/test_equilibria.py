@@ -100,6 +100,7 @@ def check_fixed_point(points, i, x1, trace):
     assert points.stable[i, 0] == (trace < 0)
 
 
+@pytest.mark.slow(first=True)
 def test_fixed_point_of_class_a_is_that_of_the_paper():
     rng = np.random.default_rng(24)
     belts = draw_belts(rng, (200,))
@@ -308,7 +309,7 @@ def test_a_belt_at_rest_ends_a_pseudo_focus_in_finite_time():
 
 
 def test_a_fixed_point_on_an_edge_is_listed_once_with_its_zone():
-    law = jb.Coulomb(0.5, 0.5)
+    law = jb.Conti(0.5, 0.5, 10.0)
     left = jb.Oscillator(0.5, (jb.Belt(0.3, law, upper=0.5), jb.Belt(-0.3, law, lower=0.5)))
     right = jb.Oscillator(0.5, (jb.Belt(0.3, law, upper=-0.5), jb.Belt(-0.3, law, lower=-0.5)))
     for osc, x1, modes in [(left, 0.5, [1, -2]), (right, -0.5, [2, -1])]:
@@ -462,10 +463,9 @@ def test_derivatives_of_a_fixed_point_are_those_of_the_formulas():
             (mus - p1) * (1 / s**2 - 2 * p3 * nu / s**3) / 2,
         ],
     ]
-    for jacobian in (jax.jacfwd, jax.jacrev):
-        assert np.asarray(jax.jit(jacobian(position_and_rate))(jnp.array(p))) == pytest.approx(
-            np.array(expected), **EXACT
-        )
+    both = jax.jit(lambda p: [way(position_and_rate)(p) for way in (jax.jacfwd, jax.jacrev)])
+    for found in both(jnp.array(p)):
+        assert np.asarray(found) == pytest.approx(np.array(expected), **EXACT)
 
 
 @pytest.mark.slow(first=True)
@@ -529,6 +529,7 @@ def test_a_fixed_point_at_the_end_of_a_segment_is_that(mirrored):
     assert sorted([abs(points.x1_lower[0]), abs(points.x1_upper[0])]) == [0.0, 1.0]
 
 
+@pytest.mark.slow(first=True)
 def test_derivatives_of_the_ends_of_a_segment():
     def ends(static, load, nu, edge):
         law = jb.Conti(static, 0.6, 10.0)
@@ -548,6 +549,7 @@ def test_derivatives_of_the_ends_of_a_segment():
     assert np.asarray(gradient) == pytest.approx(np.array(expected), **EXACT)
 
 
+@pytest.mark.slow(first=True)
 def test_every_derivative_is_a_number_though_edges_are_infinite():
     osc = jb.presets.class_d(-0.5, 0.55, -0.4, 0.3)
     fixed = np.flatnonzero(jb.equilibria(osc).kind == FIXED_POINT)
@@ -656,6 +658,7 @@ class Cubic(jb.AbstractFriction):
         return self.static - speed + speed**3
 
 
+@pytest.mark.slow(first=True)
 def test_a_law_of_ones_own_and_a_supercritical_point():
     nu, half_trace = 0.3, 0.005
     zeta = 1 - 3 * nu**2 - 2 * half_trace
@@ -676,7 +679,7 @@ def test_a_law_of_ones_own_and_a_supercritical_point():
 #: Damping 0 and friction that does not depend on the speed; on both sides of an edge; laws whose
 #: sum is even in the velocity: c - 0.05 x2^2 (damping 0), and a constant (damping 4 * 0.05).
 CENTRES = {
-    "constant": (0.0, jb.Belt(2.0, jb.Coulomb(1.0, 0.6))),
+    "constant": (0.0, jb.Belt(2.0, jb.Conti(0.6, 0.6, 10.0))),
     "an edge": (
         0.0,
         jb.Belt(2.0, jb.Coulomb(0.8, 0.6), upper=0.1),
@@ -700,20 +703,27 @@ CENTRES = {
     # The others take a program each.
     ["constant", *(pytest.param(n, marks=pytest.mark.slow(first=True)) for n in list(CENTRES)[1:])],
 )
-def test_a_centre_is_neutral_and_closes(name):
+def test_a_centre_is_neutral(name):
     damping, *belts = CENTRES[name]
     osc = jb.Oscillator(damping, tuple(belts))
     (point,) = jb.equilibria(osc)
     assert point.neutral and not point.stable and abs(float(point.rate)) < 1e-15
     assert repr(point).startswith("Equilibria(neutral ")
     assert point.table().neutral.tolist() == [True]
-    # One loop, and more than the first half of another: from a top it comes back to the top.
-    top = float(point.x1) + 0.3
+    (row,) = jb.equilibria(eqx.tree_at(lambda o: o.damping, osc, damping + 1e-9))
+    assert row.stable and not row.neutral
+
+
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("name", CENTRES)
+def test_orbits_around_a_centre_close(name):
+    """One loop, and more than the first half of another: from a top it comes back to the top."""
+    damping, *belts = CENTRES[name]
+    osc = jb.Oscillator(damping, tuple(belts))
+    top = float(jb.equilibria(osc).x1[0]) + 0.3
     events = jb.simulate(osc, (top, 0.0), 15.0, ts=np.linspace(0.0, 15.0, 3001))
     assert float(jnp.max(events.ys[1500:, 0])) == pytest.approx(top, abs=1e-5)
     assert jb.find_cycle(osc, (top, 0.0)).status == jb.Status.NEUTRAL
-    (row,) = jb.equilibria(eqx.tree_at(lambda o: o.damping, osc, damping + 1e-9))
-    assert row.stable and not row.neutral
 
 
 def test_a_point_of_hopf_is_no_centre():
@@ -783,26 +793,37 @@ def test_where_runs_come_to_rest_is_told_though_others_are_near():
     assert bool((told.label == 0).all())
 
 
-@pytest.mark.parametrize("edges", [(0.3, 0.3), (0.3, 0.1 + 0.2), (0.1 + 0.2, 0.3)])
+#: One edge of each of two belts, but for rounding.
+edges_but_for_rounding = pytest.mark.parametrize(
+    "edges", [(0.3, 0.3), (0.3, 0.1 + 0.2), (0.1 + 0.2, 0.3)]
+)
+
+
+def with_edges(edges, damping):
+    upper, lower = edges
+    belts = jb.Belt(0.1, LAW, upper=upper), jb.Belt(-0.2, LAW, lower=lower)
+    return jb.Oscillator(damping, belts)
+
+
+@edges_but_for_rounding
 def test_edges_that_differ_by_rounding_are_one(edges):
+    rests = jb.equilibria(with_edges(edges, 0.5))
+    assert rests.kind.tolist() == [jb.EquilibriumKind.PSEUDO_FOCUS] and not rests.stable[0]
+
+
+@pytest.mark.slow(first=True)
+@edges_but_for_rounding
+def test_edges_that_differ_by_rounding_have_one_pseudo_hopf_point(edges):
     """Around a pseudo-focus with pushes a and traces b of the sides, loops grow where the sum of
     b/a is positive."""
-    upper, lower = edges
-
-    def make(damping):
-        return jb.Oscillator(
-            damping, (jb.Belt(0.1, LAW, upper=upper), jb.Belt(-0.2, LAW, lower=lower))
-        )
-
-    rests = jb.equilibria(make(0.5))
-    assert rests.kind.tolist() == [jb.EquilibriumKind.PSEUDO_FOCUS] and not rests.stable[0]
     left, right = 0.8 - 0.3, 0.6 + 0.4 / 3 + 0.3
     zero = (1 / left + 4 / 9 / right) / (1 / left + 1 / right)
-    assert float(jb.refine(jb.PseudoHopf(0), make, at=0.8).value) == pytest.approx(zero, abs=1e-13)
+    point = jb.refine(jb.PseudoHopf(0), lambda damping: with_edges(edges, damping), at=0.8)
+    assert float(point.value) == pytest.approx(zero, abs=1e-13)
 
 
 def test_what_a_belt_at_rest_holds_in_one_point_is_no_segment():
-    held = jb.Belt(0.0, jb.Coulomb(0.8, 0.8), lower=0.0, upper=0.85)
+    held = jb.Belt(0.0, jb.Conti(0.8, 0.8, 10.0), lower=0.0, upper=0.85)
     osc = jb.Oscillator(0.5, (jb.Belt(0.3, jb.Conti(1.2, 0.7, 10.0), 2.0), held))
     rests = jb.equilibria(osc)  # 2 * 0.825 - 0.8 = 0.85
     assert rests.kind.tolist() == [jb.EquilibriumKind.FIXED_POINT]

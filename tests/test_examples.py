@@ -6,6 +6,7 @@ One page a test. The names that the index of the reference takes for granted are
 import ast
 import builtins
 import doctest
+import json
 import re
 from pathlib import Path
 
@@ -40,7 +41,9 @@ bifurcation_curve bifurcation_diagram circle_map class design distance_to distan
 find_cycle fit minimal_fatal_shock orbit_diagram plot_basins portrait region_map scan
 """.split()
 #: Long, and the only examples of what they show.
-FIRST = "Arcs", "Basins-class", "explore", "forcing", "laws", "simulate"
+FIRST = """
+Arcs Basins-class HopfAtInfinity Tabulated explore forcing in_si laws lyapunov simulate verify
+""".split()
 
 
 def examples(path: Path) -> str:
@@ -81,7 +84,6 @@ def test_the_page_on_scaling_runs():
         for osc, one in ((own.oscillator, own), (held, m))
     )
     assert next(periods) == pytest.approx(next(periods), rel=1e-9)
-    plt.close("all")
 
 
 def test_the_code_of_the_gallery_runs_after_the_lines_that_it_shows():
@@ -100,7 +102,6 @@ def test_the_code_of_the_gallery_runs_after_the_lines_that_it_shows():
             assert used - local <= {*given, *dir(builtins)}, one.name
     assert not shown
     assert len(given["friction_laws"]().axes) == 3
-    plt.close("all")
 
 
 @pytest.mark.parametrize(
@@ -118,5 +119,31 @@ def test_example_prints_what_its_page_says(page):
     test = doctest.DocTestParser().get_doctest(examples(path), dict(GIVEN), page, str(path), 0)
     told: list[str] = []
     doctest.DocTestRunner(optionflags=options).run(test, out=told.append)
-    plt.close("all")
     assert not told, "".join(told)
+
+
+# --- notebooks, in the small setting where they have one ------------------------------------------
+
+
+NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
+#: What the others show takes minutes, and has tests of its own.
+BY_DAY = ("01_first_steps", "02_sweeps", "06_atlas", "08_response")
+
+
+@pytest.mark.filterwarnings("ignore:FigureCanvasAgg is non-interactive:UserWarning")
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(path, marks=pytest.mark.slow(first=path.stem in BY_DAY), id=path.stem)
+        for path in NOTEBOOKS
+    ],
+)
+def test_notebook_runs(path):
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    namespace = {}
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            source = "".join(cell["source"]).replace("\nFULL = True", "\nFULL = False")
+            # Optax relies on promotion, as users of a notebook may.
+            with jax.numpy_dtype_promotion("standard"):
+                exec(compile(source, path.name, "exec"), namespace)

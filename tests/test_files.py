@@ -1,6 +1,5 @@
 """Oscillators and machines from a file: what the Python classes are, and results in SI units."""
 
-import csv
 import functools
 import json
 import re
@@ -13,6 +12,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
+from test_cli import column, read
 from typer.testing import CliRunner
 
 import jaxbelt as jb
@@ -53,15 +53,6 @@ def described(folder, text) -> Any:
 
 def run(*words):
     return CliRunner().invoke(app, [*map(str, words)])
-
-
-def read(path):
-    with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
-def column(rows, name):
-    return np.array([float(row[name]) for row in rows])
 
 
 # --- what a file describes ----------------------------------------------------------------------
@@ -403,6 +394,7 @@ def test_a_file_that_is_not_there(tmp_path):
 # --- results in SI units ------------------------------------------------------------------------
 
 
+@pytest.mark.slow(first=True)
 def test_simulate_in_si_units(tmp_path):
     out = tmp_path / "run"
     words = "--start", 0.05, 0, "--t1", END, "--samples", SAMPLES, "--json", "--out", out
@@ -427,6 +419,7 @@ def test_simulate_in_si_units(tmp_path):
     assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow(first=True)
 def test_a_sweep_over_a_machine_is_a_loop_over_machines(tmp_path):
     """Also where the force varies that makes the unit of length; starts are in metres."""
     forces, starts, out = (10.0, 40.0), (0.0, 0.05), tmp_path / "sweep.nc"

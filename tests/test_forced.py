@@ -62,12 +62,15 @@ def test_text_of_a_forced_oscillator_makes_it_again():
     assert "forcing" not in repr(jb.presets.class_a(0.3))
 
 
+@pytest.mark.slow(first=True)
 def test_a_frequency_of_zero_is_a_constant_force_without_a_clock():
     push = 0.5 * cos(0.3)
-    osc = forced_one(forcing=jb.Harmonic(0.5, 0.0, 0.3), velocity=jb.Oscillating(0.2, 0.1, 0, 0.0))
+    law = jb.Conti(1.0, 0.6, 10.0)  # that of class (a), for one program without forcing
+    velocity = jb.Oscillating(0.2, 0.1, 0, 0.0)
+    osc = forced_one(law=law, forcing=jb.Harmonic(0.5, 0.0, 0.3), velocity=velocity)
     assert not has_clock(osc)
     assert float(osc.belts[0].velocity) == pytest.approx(0.3, abs=1e-15)
-    still = forced_one(forcing=())
+    still = forced_one(law=law, forcing=())
     rest, rest_still = jb.equilibria(osc), jb.equilibria(still)
     np.testing.assert_allclose(rest.x1, rest_still.x1 + push, atol=1e-15)
     cycle, cycle_still = jb.find_cycle(osc, (1.0, 0.0)), jb.find_cycle(still, (1.0 - push, 0.0))
@@ -77,6 +80,7 @@ def test_a_frequency_of_zero_is_a_constant_force_without_a_clock():
     assert has_clock(forced_one())
 
 
+@pytest.mark.slow(first=True)
 def test_a_constant_force_in_a_sweep_is_the_origin_moved():
     def make(push):
         return forced_one(law=jb.Conti(1.0, 0.6, 10.0), forcing=jb.Harmonic(push, 0.0))
@@ -192,7 +196,7 @@ def engine_cases(number, count, structure):
     ("structure", "count"),
     [
         (0, 40),  # Coulomb, one force
-        (1, 20),  # cubic, one force
+        pytest.param(1, 20, marks=pytest.mark.slow(first=True)),  # cubic, one force
         pytest.param(2, 20, marks=pytest.mark.slow),  # two belts with edges
         # Two belts with edges, a velocity that oscillates, two forces.
         pytest.param(3, 20, marks=pytest.mark.slow),
@@ -241,6 +245,7 @@ def test_a_belt_at_rest_holds_for_ever_only_within_its_capacity():
 # --- closed forms ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("frequency", [0.7, 1.4, 2.2])
 def test_den_hartogs_motion_without_stops(frequency):
     """x = S - S cos t - S tan(beta/2) sin t + V cos(Omega t + phi) on the way down, with
@@ -266,6 +271,7 @@ def test_den_hartogs_motion_without_stops(frequency):
     np.testing.assert_allclose(run.ys[-1], [top, 0.0], atol=1e-10)
 
 
+@pytest.mark.slow(first=True)
 def test_csernaks_family_of_periodic_motions():
     """Omega = 1/2: a motion of period 4 pi for every A, closed in itself."""
     V, S, A = 1.0, 0.04, 0.05
@@ -304,17 +310,20 @@ def test_reflected():
     assert_same(end_of(forced_one()), (-y, t, kinds))
 
 
+@pytest.mark.slow(first=True)
 def test_a_moving_support_is_a_force():
     amplitude = 0.9 / sqrt(1 + (0.1 * 1.3) ** 2)
     base = jb.BaseMotion(amplitude, 1.3, 0.4 - atan(0.1 * 1.3))
     assert_same(end_of(forced_one()), end_of(forced_one(forcing=base)))
 
 
+@pytest.mark.slow(first=True)
 def test_a_force_in_two_halves_is_one():
     half = jb.Harmonic(0.45, 1.3, 0.4)
     assert_same(end_of(forced_one()), end_of(forced_one(forcing=(half, half))))
 
 
+@pytest.mark.slow(first=True)
 def test_without_amplitude_it_is_the_motion_without_forcing():
     osc = forced_one(forcing=jb.Harmonic(0.0, 1.3))
     assert_same(end_of(osc), end_of(forced_one(forcing=())))
@@ -355,7 +364,13 @@ def test_a_force_of_ones_own_is_the_sum_of_its_waves():
     assert_same(end_of(own), end_of(forced_one(forcing=forces, load=8 * 0.7)))
 
 
-@pytest.mark.parametrize("formulation", ["switch", pytest.param("smooth", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "formulation",
+    [
+        pytest.param("switch", marks=pytest.mark.slow(first=True)),
+        pytest.param("smooth", marks=pytest.mark.slow),
+    ],
+)
 def test_approximations_approach_the_exact_motion(formulation):
     osc = forced_one(law=jb.Coulomb(1.0, 1.0), velocity=jb.Oscillating(0.3, 0.1, 0.7), load=2.0)
     exact = jb.simulate(osc, (1.0, 0.2), 6.0, ts=[6.0])
@@ -375,6 +390,7 @@ def test_approximations_approach_the_exact_motion(formulation):
 # --- transformations ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(first=True)
 def test_derivatives_are_differences_of_the_engine():
     """Along all numbers together: start, damping, omega, belt, force, and of t0 and T alone."""
     rng = np.random.default_rng(3)

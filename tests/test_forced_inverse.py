@@ -291,6 +291,7 @@ def test_design_meets_an_amplitude_at_a_frequency():
     plan.plot()
 
 
+@pytest.mark.slow(first=True)
 def test_design_finds_the_frequency_of_the_closed_form():
     plan = jb.design(den_hartog(0.6), [(jb.amplitude, 2.0)], where=frequency_of)
     assert int(plan.status) == OK
@@ -344,6 +345,7 @@ def test_design_says_why_it_ends():
     assert int(nothing.status) == jb.Status.NOT_SETTLED and np.isnan(nothing.achieved[0])
 
 
+@pytest.mark.slow(first=True)
 def test_designs_do_not_depend_on_the_unit_of_length():
     belt, force = jb.Belt(0.0, jb.Coulomb(0.4, 0.4), 4.0), jb.Harmonic(4.0, 0.7)
     large = jb.Oscillator(0.05, (belt,), forcing=force)

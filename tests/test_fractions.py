@@ -2,10 +2,10 @@
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from compilations import compilations
+from where import nu0
 
 import jaxbelt as jb
 from jaxbelt.cycles.attractors import Runs
@@ -23,10 +23,6 @@ NU1, BOX, KEY = 0.35, ((-1.0, 3.0), (-1.0, 1.0)), jax.random.key(4)
 HOPF, FOLD = 0.263654916039, 0.538734800481
 
 
-def nu0(osc):
-    return osc.belts[0].velocity
-
-
 def by_nu0():
     """What is varied where that does not matter."""
     return varied(jb.presets.class_b(0.3, NU1), nu0, (0.3,))
@@ -41,12 +37,6 @@ def along(osc, span, rows, **options):
 @pytest.fixture(scope="module")
 def found():
     return along(jb.presets.class_b(0.3, NU1), (-0.7, 0.7), 29)
-
-
-@pytest.fixture(autouse=True)
-def close_figures():
-    yield
-    plt.close("all")
 
 
 @pytest.mark.slow(first=True)

@@ -297,6 +297,7 @@ def test_an_import_in_a_function_of_ones_own_code_is_refused():
         fingerprint(imports_own)
 
 
+@pytest.mark.slow(first=True)
 def test_it_is_the_same_in_another_process():
     told = {name: fingerprint(make()) for name, make in READERS.items()}
     told |= {f"value {name}": fingerprint(pair[0]) for name, pair in VALUES.items()}

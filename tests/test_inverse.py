@@ -6,6 +6,7 @@ import numpy as np
 import oracle
 import oracle_cycles
 import pytest
+from where import nu0
 
 import jaxbelt as jb
 from jaxbelt import Status
@@ -358,11 +359,6 @@ def stick(cycle):
     return jb.stick_duration(cycle, 1)
 
 
-def nu0(osc):
-    return osc.belts[0].velocity
-
-
-@pytest.mark.slow(first=True)
 def test_design_meets_a_stick_duration():
     told = []
     plan = jb.design(jb.presets.class_b(0.45, 0.35), [(stick, 0.5)], where=nu0, report=told.append)

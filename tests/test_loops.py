@@ -25,8 +25,6 @@ OSCILLATORS = {
         0.1, (jb.Belt(0.2, jb.Coulomb(1.0, 0.5)), jb.Belt(-0.3, PAPER, 0.5, 0.0))
     ),
 }
-#: Those that take a program of their own.
-OF_ITS_OWN = "edges", "a static limit"
 
 
 def run_of(osc, y0, t0, t1):
@@ -34,13 +32,8 @@ def run_of(osc, y0, t0, t1):
     return jb.simulate(osc, y0, t1, t0=t0, ts=ts, max_segments=ARCS)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.slow(first=True) if name in OF_ITS_OWN else [])
-        for name in OSCILLATORS
-    ],
-)
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("name", OSCILLATORS)
 def test_a_run_is_that_of_its_pieces(name):
     """Each loop is followed in the pieces. Both are right to a hundredth of 1e-10 an arc; what
     remains of that after a stick phase is a shift of the time."""

@@ -8,7 +8,8 @@ static coefficient 1 and kinetic coefficient 1/2, and there is no damping, so
     x2' = -x1 + sum of s/2 load,    and a belt holds a needed force of size up to its load.
 """
 
-from collections.abc import Callable
+import dataclasses
+import functools
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -39,10 +40,6 @@ class Row(NamedTuple):
     mode: tuple[int, ...]
     event: tuple[EventKind, int]
     after: tuple[int, ...]
-
-    @property
-    def osc(self) -> Oscillator:
-        return Oscillator(0.0, self.belts)
 
 
 ONE, BACK, STILL = (belt(0.5),), (belt(-0.5),), (belt(0.0),)
@@ -118,29 +115,42 @@ TABLE = [
         (0.0, 0.0), (-1, BELOW), (STICK, 0), (0, BELOW)),
     Row("at rest in a slip mode",        ONE,     (-0.4, 0.0), (1,),    (STICK, 0), (0,)),
 ]
-
-
-class Rest(NamedTuple):
-    """A start at which the motion ends at once: its mode, and the status of a run."""
-
-    name: str
-    belts: tuple[jb.Belt, ...]
-    y: tuple[float, float]
-    mode: tuple[int, ...]
-    status: Status
-
-    @property
-    def osc(self) -> Oscillator:
-        return Oscillator(0.0, self.belts)
-
-
-RESTS = [
-    Rest("fixed point of a slip mode",   ONE,   (0.5, 0.0), (1,), Status.EQUILIBRIUM),
-    Rest("stuck to a belt at rest",      STILL, (0.9, 0.0), (0,), Status.STUCK_FOREVER),
-    Rest("pushed back by both sides of an edge", (belt(0.5, upper=0.0), belt(-0.5, lower=0.0)),
-         (0.0, 0.0), (1, BELOW), Status.PSEUDO_FOCUS),
-]
 # fmt: on
+
+
+def beside_another(belts: tuple[jb.Belt, ...]) -> tuple[jb.Belt, ...]:
+    """Two belts with an edge, one of them where no row comes to: of a structure that one program
+    of each engine serves."""
+    if len(belts) == 1:
+        return *belts, belt(-0.2, lower=FAR)
+    if not np.any(np.isfinite([(one.lower, one.upper) for one in belts])):
+        return belts[0], dataclasses.replace(belts[1], upper=jnp.asarray(FAR))
+    return belts
+
+
+FAR = 40.0
+
+
+def steady(nu: float, mu: float, lower: float = -np.inf, upper: float = np.inf) -> jb.Belt:
+    """Of a constant friction, by the law of most other tests, for one program with them."""
+    return jb.Belt(nu, jb.Conti(mu, mu, 10.0), 1.0, lower, upper)
+
+
+#: Starts at which the motion ends at once: its mode, and the status of a run.
+RESTS = {
+    "fixed point of a slip mode": (
+        (steady(0.5, 0.5), steady(-0.2, 0.5, lower=FAR)),
+        *((0.5, 0.0), (1, BELOW), Status.EQUILIBRIUM),
+    ),
+    "stuck to a belt at rest": (
+        (steady(0.0, 1.0), steady(-0.2, 1.0, lower=FAR)),
+        *((0.9, 0.0), (0, BELOW), Status.STUCK_FOREVER),
+    ),
+    "pushed back by both sides of an edge": (
+        (steady(0.5, 0.5, upper=0.0), steady(-0.5, 0.5, lower=0.0)),
+        *((0.0, 0.0), (1, BELOW), Status.PSEUDO_FOCUS),
+    ),
+}
 
 
 class Seen(NamedTuple):
@@ -199,40 +209,81 @@ class FirstEvent:
 FIRST = FirstEvent()
 
 
-def by_sweep(osc: Oscillator, y) -> Seen:
-    def mode_at(t1):
-        found = lists.swept([osc], y0=y, t1=t1, observe="final")
-        return ints(np.asarray(found.mode_end)[0])
+@functools.cache
+def made(beside: bool, count: int):
+    """The function that makes the oscillator of a row, and the rows of so many belts."""
+    rows = [row for row in TABLE if beside or len(row.belts) == count]
+    return lists.maker([oscillator(row, beside) for row in rows]), rows
 
-    run = lists.swept([osc], y0=y, t1=LONG, observe=FIRST)
-    t, kind, number = np.asarray(run["first"])[0]
-    return Seen(mode_at(AT_ONCE), (EventKind(int(kind)), int(number)), mode_at(t + AT_ONCE))
+
+@functools.cache
+def from_all_starts(beside: bool, count: int, t1: float, observe):
+    """What the rows do from the starts of them all."""
+    make, rows = made(beside, count)
+    starts = {name: sorted({row.y[i] for row in rows}) for i, name in enumerate(("x1", "x2"))}
+    axes = {"case": np.arange(len(rows), dtype=float)} | starts
+    return jb.sweep(make, axes, t1=t1, observe=observe, progress=False)
+
+
+def by_sweep(osc: Oscillator, y, row: Row, beside: bool) -> Seen:
+    make, rows = made(beside, len(osc.belts))
+    here = {"case": float(rows.index(row)), "x1": y[0], "x2": y[1]}
+
+    def from_start(t1, observe):
+        return from_all_starts(beside, len(osc.belts), t1, observe).sel(here)
+
+    t, kind, number = from_start(LONG, FIRST)["first"].values
+    after = jb.sweep(
+        make, {name: [at] for name, at in here.items()}, t1=t + AT_ONCE, progress=False
+    )
+    return Seen(
+        ints(from_start(AT_ONCE, "final").mode_end.values),
+        (EventKind(int(kind)), int(number)),
+        ints(after.mode_end.values.ravel()),
+    )
+
+
+def oscillator(row: Row, beside: bool) -> Oscillator:
+    return Oscillator(0.0, beside_another(row.belts) if beside else row.belts)
 
 
 ENGINES = {"simulate": by_simulate, "orbits": by_orbit, "sweep": by_sweep}
 
 
-@pytest.mark.parametrize("engine", ENGINES.values(), ids=ENGINES)
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize(
+    "beside",
+    [
+        pytest.param(True, id="beside another"),
+        # Each number of belts takes a program, and so do belts without edges.
+        pytest.param(False, id="alone", marks=pytest.mark.slow(first=True)),
+    ],
+)
 @pytest.mark.parametrize("row", TABLE, ids=[row.name for row in TABLE])
-def test_transition(row: Row, engine: Callable):
-    assert engine(row.osc, row.y) == Seen(row.mode, row.event, row.after)
+def test_transition(row: Row, beside: bool, engine: str):
+    osc = oscillator(row, beside)
+    more = (BELOW,) * (len(osc.belts) - len(row.belts))
+    seen = ENGINES[engine](osc, row.y, *((row, beside) if engine == "sweep" else ()))
+    assert seen == Seen((*row.mode, *more), row.event, (*row.after, *more))
 
 
-@pytest.mark.parametrize("rest", RESTS, ids=[rest.name for rest in RESTS])
-def test_rest(rest: Rest):
+@pytest.mark.parametrize("name", RESTS)
+def test_rest(name: str):
     """An end that is no event. An equilibrium is no end for a run of `simulate`: it stays."""
-    run = jb.simulate(rest.osc, rest.y, LONG, max_segments=ARCS)
-    ends = rest.status != Status.EQUILIBRIUM
-    assert run.status == (rest.status if ends else Status.OK) and run.events.t.size == 0
-    np.testing.assert_allclose(run.ys, np.broadcast_to(rest.y, run.ys.shape), atol=1e-15)
-    assert ints(run.arcs.mode[0]) == rest.mode
+    belts, y, mode, status = RESTS[name]
+    osc = Oscillator(0.0, belts)
+    run = jb.simulate(osc, y, LONG, max_segments=ARCS)
+    ends = status != Status.EQUILIBRIUM
+    assert run.status == (status if ends else Status.OK) and run.events.t.size == 0
+    np.testing.assert_allclose(run.ys, np.broadcast_to(y, run.ys.shape), atol=1e-15)
+    assert ints(run.arcs.mode[0]) == mode
 
-    assert jb.find_cycle(rest.osc, rest.y).status == rest.status
+    assert jb.find_cycle(osc, y).status == status
 
-    found = lists.swept([rest.osc], y0=rest.y, t1=LONG, observe="attractor").squeeze()
-    kind = "stuck" if rest.status == Status.STUCK_FOREVER else "equilibrium"
+    found = lists.swept([osc], y0=y, t1=LONG, observe="attractor").squeeze()
+    kind = "stuck" if status == Status.STUCK_FOREVER else "equilibrium"
     assert jb.decoded(found).kind == kind and found.n_events == 0
-    assert (found.x1_min, found.x1_max) == (rest.y[0], rest.y[0])
+    assert (found.x1_min, found.x1_max) == (y[0], y[0])
 
 
 def test_a_loop_of_no_modes_has_no_events():

@@ -319,6 +319,7 @@ def test_reversed_time_runs_back():
     assert back.y_end == pytest.approx((0.35, 0.0), **EXACT)
 
 
+@pytest.mark.slow(first=True)
 def test_events_agree_with_time_stepping_of_the_inclusion():
     """Set-valued friction stepped implicitly knows no events; it converges with order one."""
     T, cases = 12.0, []
@@ -441,6 +442,7 @@ def test_unstable_cycle_repeats_and_its_multiplier_is_the_slope_of_the_return_ma
     assert cycle.multiplier > 1 and cycle.x2_max < 0.22
 
 
+@pytest.mark.slow(first=True)
 def test_unstable_cycle_exists_between_hopf_point_and_fold():
     assert unstable_cycle(class_a(0.18)) is None
     assert unstable_cycle(class_a(0.268)) is None

@@ -3,13 +3,13 @@
 import dataclasses
 from types import SimpleNamespace
 
-import matplotlib.pyplot as plt
 import numpy as np
 import oracle
 import pytest
 from compilations import compilations
 from matplotlib.backend_bases import MouseEvent
 from scipy.optimize import brentq
+from where import nu0
 
 import jaxbelt as jb
 from jaxbelt.plotting.orbits import plot_orbits
@@ -20,10 +20,6 @@ NU1 = 0.35
 CLOSE = dict(rtol=0, atol=1e-6)
 
 
-def nu0(osc):
-    return osc.belts[0].velocity
-
-
 def height(osc, x1, x2):
     return x2 - 0.1 * (x1 - 0.6)
 
@@ -32,12 +28,6 @@ def height(osc, x1, x2):
 def diagram():
     starts = [(3.0, 0.0), (1.362, 0.0)]
     return jb.orbit_diagram(jb.presets.class_b(0.3, NU1), nu0, (-0.5, 0.45), y0=starts, rows=3)
-
-
-@pytest.fixture(autouse=True)
-def close_figures():
-    yield
-    plt.close("all")
 
 
 def zeros(run, value, first, last):

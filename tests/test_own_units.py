@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from where import nu0, nu1
 
 import jaxbelt as jb
 from jaxbelt.model.own_units import in_own_units, in_units_of_user, own_length, power_of_two_below
@@ -25,14 +26,6 @@ def oscillator(nu0=0.45, nu1=0.35, *, length=1.0, omega=1.0, damping=0.5, **edge
     edges = {name: value * length for name, value in edges.items()}
     belts = jb.Belt(nu0 * speed, law, length, **edges), jb.Belt(nu1 * speed, law, length)
     return jb.Oscillator(damping, belts, omega)
-
-
-def nu0(osc):
-    return osc.belts[0].velocity
-
-
-def nu1(osc):
-    return osc.belts[1].velocity
 
 
 def powers_of(name, length, speed):
@@ -69,6 +62,7 @@ def units(request):
     return 2.0**k, 2.0**m
 
 
+@pytest.mark.slow(first=True)
 def test_motions(units):
     length, omega = units
     osc, other = oscillator(), oscillator(length=length, omega=omega)
@@ -212,6 +206,7 @@ def test_sweeps(units):
     same(one.d_x1_end_d_nu0, two.d_x1_end_d_nu0, 1 / omega)
 
 
+@pytest.mark.slow(first=True)
 def test_basins(units):
     length, omega = units
     osc, other = oscillator(), oscillator(length=length, omega=omega)

@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import pytest
 
 import jaxbelt
@@ -201,7 +200,6 @@ def test_examples_of_the_readme_run():
     examples = re.findall(r"^```python\n(.+?)^```$", readme, re.MULTILINE | re.DOTALL)
     assert examples
     exec(compile("\n".join(examples), "README.md", "exec"), {})
-    plt.close("all")
 
 
 @pytest.mark.parametrize("mark", ["tests", "slow tests"])

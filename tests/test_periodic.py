@@ -275,6 +275,7 @@ def test_no_number_depends_on_the_unit_of_length(sticking):
     np.testing.assert_array_equal(motion.stick_durations, sticking.stick_durations)
 
 
+@pytest.mark.slow(first=True)
 def test_grazing_of_the_motion_of_four_periods(smooth):
     point = jb.refine(jb.GrazingSliding(0), bkn(1.7079), where=frequency_of, start=smooth)
     assert int(point.status) == OK
@@ -346,6 +347,7 @@ def test_a_curve_of_grazing_is_what_refine_finds(smooth):
     assert again.place == pytest.approx(curve.places[row], abs=1e-6)
 
 
+@pytest.mark.slow(first=True)
 def test_fold_of_the_sticking_motion(sticking):
     point = jb.refine(jb.Fold(), bkn(1.68), where=frequency_of, start=sticking)
     assert int(point.status) == OK
@@ -438,6 +440,7 @@ def limit_without_stops():
     return brentq(excess, 0.5, 0.6, xtol=1e-14)
 
 
+@pytest.mark.slow(first=True)
 def test_den_hartog_without_stops():
     motion = jb.find_cycle(den_hartog(0.6), (0.0, 0.0))
     assert motion.periods == 1

@@ -31,12 +31,6 @@ def two_sided():
     return jb.presets.class_b(-0.2, 0.35), run(-0.2)
 
 
-@pytest.fixture(autouse=True)
-def close_figures():
-    yield
-    plt.close("all")
-
-
 def spans(ax):
     """(begin, end) of the shaded spans of some axes, in order."""
     boxes = [patch.get_path().get_extents(patch.get_patch_transform()) for patch in ax.patches]
@@ -90,7 +84,6 @@ def test_the_key_of_a_trajectory_has_the_belts_in_order(two_sided):
     for run in (trajectory, swapped):
         words = [text.get_text() for text in run.plot().get_legend().get_texts()]
         assert words[-2:] == ["sticks to belt 0", "sticks to belt 1"]
-    plt.close("all")
 
 
 def test_a_stick_phase_across_a_contact_edge_is_one(two_sided):

@@ -6,7 +6,6 @@ The campaign is `python -m tests.campaign portraits`; what it found is in docs/c
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 import oracle
 import pytest
@@ -96,7 +95,6 @@ def test_picture_shows_everything(class_d):
     labels = [line.get_label() for line in ax.get_lines()]
     assert labels.count("stable cycle") == 2 and labels.count("saddle") == 2
     assert labels.count("stable separatrix") == labels.count("unstable separatrix") == 4
-    plt.close("all")
 
 
 def test_bad_arguments_are_refused_by_name():
@@ -495,6 +493,7 @@ def test_separatrices_come_from_out_of_reach_where_loops_hardly_grow():
         assert one.end == "outside" and np.max(np.abs(np.asarray(one.ys))) >= told.reach
 
 
+@pytest.mark.slow(first=True)
 def test_a_belt_at_rest_without_load_changes_nothing():
     """Its boundary lies where x1 is extremal: which of the two ends an arc is not left to rounding,
     by which lowest points of x1 were taken for the highest ones."""
@@ -507,6 +506,7 @@ def test_a_belt_at_rest_without_load_changes_nothing():
     assert float(told.cycles[0].period) == period
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("edges", [(0.3, 0.3), (0.3, 0.1 + 0.2), (0.1 + 0.2, 0.3)])
 def test_a_saddle_on_edges_that_are_one_up_to_rounding_is_one(edges):
     law, (upper, lower) = jb.Conti(1.0, 0.6, 10.0), edges
@@ -552,6 +552,7 @@ def test_a_jump_of_the_map_of_tops_is_no_gap(law, damping, omega, belts):
     assert len(told.cycles) == 1 and not told.unstable
 
 
+@pytest.mark.slow(first=True)
 def test_loops_around_a_fixed_point_on_an_edge_grow_as_its_rate_says():
     """Next to it, where their growth is rounding: an excursion over the edge, of 4e-15, is twenty
     floats long."""

@@ -208,6 +208,7 @@ print(compiling.jit(solve)(np.array([[2.0, 1.0], [1.0, 3.0]]), np.ones(2)).tolis
     assert len(files(folder)) == 1
 
 
+@pytest.mark.slow(first=True)
 def test_a_users_own_cache_of_jax_does_no_harm(folder, tmp_path):
     """A program that came out of JAX's cache could not be loaded again."""
     script = """
@@ -339,6 +340,7 @@ def test_the_least_recently_used_go(folder, monkeypatch):
     assert sum(one.size for one in programs.entries()) <= programs.BOUND
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.skipif(sys.platform == "win32", reason="processes are forked")
 def test_processes_killed_at_random_leave_nothing_wrong(tmp_path):
     assert campaign(tmp_path, kills=12, seed=0)

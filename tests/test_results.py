@@ -13,6 +13,7 @@ import pytest
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
+from where import nu0
 
 import jaxbelt as jb
 from jaxbelt.commands.map import cells_along, write_cells
@@ -42,10 +43,6 @@ NO_RESULTS = {
 }
 PUBLIC = [getattr(jb, name) for name in jb.__all__]
 RESULTS = [one for one in PUBLIC if inspect.isclass(one) and one not in NO_RESULTS]
-
-
-def nu0(osc):
-    return osc.belts[0].velocity
 
 
 def forced_motion() -> jb.PeriodicMotion:
@@ -121,12 +118,6 @@ def results() -> dict[type, Any]:
         jb.Verified((0, 1, 3), (4,), (2,), False),
     ]
     return {type(one): one for one in found}
-
-
-@pytest.fixture(autouse=True)
-def close_figures():
-    yield
-    plt.close("all")
 
 
 def test_every_public_class_is_a_result_or_known_to_be_none(results):

@@ -349,7 +349,17 @@ READERS = {
 }
 
 
-@pytest.mark.parametrize("reader", READERS)
+#: The others take as long to compile, and are told by one rule, see tests/test_identity.py.
+RARELY = "a law", "an observable", "its section"
+
+
+@pytest.mark.parametrize(
+    "reader",
+    [
+        pytest.param(name, marks=pytest.mark.slow(first=True) if name in RARELY else [])
+        for name in READERS
+    ],
+)
 def test_what_a_function_reads_belongs_to_the_question(reader, tmp_path, monkeypatch):
     make, observe, word = READERS[reader]
 

@@ -50,6 +50,7 @@ def test_periodic_motions_are_those_of_find_cycle(labels):
         np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
+@pytest.mark.slow(first=True)
 def test_an_approach_from_two_sides_in_turn_has_the_period_of_its_end(labels):
     """At 1.715 the largest multiplier is near -1: the motion repeats after four periods first."""
     row = labels.sel(frequency=1.715)
@@ -193,6 +194,7 @@ def test_periods_are_those_that_all_frequencies_have_in_common():
     assert jb.decoded(found).kind[0] != "periodic" and found.periods[0] == 0
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("k", [-20, 20])
 def test_labels_do_not_depend_on_the_unit_of_length(labels, k):
     unit = 2.0**k
@@ -323,6 +325,7 @@ def test_what_is_for_forced_oscillators_only(observe, t1, message):
         jb.sweep(make, {"velocity": [0.1]}, t1=t1, observe=observe)
 
 
+@pytest.mark.slow(first=True)
 def test_pictures_and_shares_of_forced_sweeps(labels):
     """A picture of stick durations has those of periodic motions; shares are for loops."""
     lines = jb.plot_sweep(labels, "stick_duration").lines

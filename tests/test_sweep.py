@@ -10,7 +10,6 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 import lists
-import matplotlib.pyplot as plt
 import numpy as np
 import oracle
 import oracle_cycles
@@ -23,6 +22,7 @@ import jaxbelt as jb
 from jaxbelt import Status
 from jaxbelt.cli import app
 from jaxbelt.kernel.lanes import Observer, Variable
+from jaxbelt.kernel.marks import Mark, code_of
 from jaxbelt.numerics.widths import SideBySide
 from jaxbelt.sweeps import store, threads
 from jaxbelt.sweeps.question import Question
@@ -52,6 +52,7 @@ def test_the_dataset_is_labelled(dataset):
     assert "velocity of belt 0" in str(dataset.nu0.attrs) and "x1_end" in repr(dataset)
 
 
+@pytest.mark.slow(first=True)
 def test_axes_of_starts_and_of_functions_with_fixed_arguments(dataset):
     make = functools.partial(jb.presets.class_b, nu1=0.35)
     starts = jb.sweep(make, {"x1": [1.0, 3.0], "nu0": NU0}, t1=SPAN)
@@ -73,13 +74,8 @@ def test_a_mass_at_rest_is_near_no_edge():
 def test_a_motion_that_grows_beyond_all_bounds_keeps_nobody_waiting(observe):
     """At 1e103 cubes overflow and steps become ever smaller; so many would be made until t1."""
     belts = jb.presets.class_b(0.3, 0.35).belts
-    dataset = jb.sweep(
-        lambda damping: jb.Oscillator(damping, belts),
-        {"damping": [-0.1, 0.5], "x1": [20.0]},
-        y0=(0.0, 5.0),
-        t1=30_000.0,
-        observe=observe,
-    )
+    oscillators = [jb.Oscillator(damping, belts) for damping in (-0.1, 0.5)]
+    dataset = lists.swept(oscillators, y0=(20.0, 5.0), t1=30_000.0, observe=observe)
     grows, settles = dataset.status.values.ravel()
     assert grows == Status.NOT_FINITE and settles == Status.OK
 
@@ -210,7 +206,6 @@ def test_every_dataset_can_be_drawn_and_written(tmp_path, dataset):
         ):
             assert read.load().equals(one)
             assert jb.decoded(read).equals(jb.decoded(one))
-    plt.close("all")
     words = jb.decoded(attractors)
     assert set(words.kind.values.ravel()) <= {"undecided", "equilibrium", "cycle", "stuck"}
     assert np.array_equal(words.kind == "cycle", attractors.kind == 2)
@@ -395,3 +390,55 @@ def test_several_derivatives_are_each_by_itself(monkeypatch):
         one = sweep(name)
         for variable in one.variables:
             np.testing.assert_array_equal(both[variable], one[variable])
+
+
+# --- audits ---------------------------------------------------------------------------------------
+
+
+def test_huge_loads_do_not_stop_a_sweep():
+    law = jb.Conti(1.0, 0.6, 10.0)
+    osc = jb.Oscillator(0.5, (jb.Belt(0.3, law, 1e8), jb.Belt(0.3, law, 0.0)))
+    found = lists.swept([osc], y0=(3.0, 0.0), t1=50.0)
+    # It sticks at once (after 4e-9) and is carried along.
+    assert found.status == Status.OK and found.n_events == 1
+    np.testing.assert_allclose(found.x1_end, 3.0 + 0.3 * 50.0, rtol=0, atol=1e-7)
+
+
+# --- audits ---------------------------------------------------------------------------------------
+
+AUDITED = {"nu0": np.array([0.2, 0.4, 0.6]), "nu1": np.array([-0.9, -0.4, 0.3])}
+
+
+@pytest.mark.parametrize("observe", ["final", "attractor"])
+def test_audits_find_nothing(observe):
+    found = jb.sweep(
+        jb.presets.class_b, AUDITED, t1=200.0, observe=observe, audit=0.5, progress=False
+    )
+    assert (found.attrs["audited"], found.attrs["audit_differed"]) == (5, 0)
+
+
+@pytest.mark.parametrize(
+    "observe",
+    [
+        pytest.param("final", marks=pytest.mark.slow(first=True)),
+        pytest.param("attractor", marks=pytest.mark.slow),
+    ],
+)
+def test_audits_find_repeats_that_are_none(observe, monkeypatch):
+    def in_part(mark, lanes, close):
+        same = code_of(lanes.mode) == mark.code
+        return same & (abs(lanes.x1 - mark.x1) <= close)
+
+    monkeypatch.setattr(Mark, "met_by", in_part)
+    threads.compiled.cache_clear()
+    with pytest.warns(UserWarning, match="1 of 9 audited runs differ .* indices \\(2, 0\\)"):
+        found = jb.sweep(
+            jb.presets.class_b, AUDITED, t1=60.0, observe=observe, audit=1.0, progress=False
+        )
+    threads.compiled.cache_clear()
+    assert found.attrs["audit_differed"] == 1
+
+
+def test_what_cannot_be_audited_is_refused():
+    with pytest.raises(ValueError, match="audit must be a share from 0 to 1, got 2"):
+        jb.sweep(jb.presets.class_b, AUDITED, t1=1.0, audit=2.0)

@@ -6,13 +6,10 @@ import oracle
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, minimize_scalar
+from where import nu0
 
 import jaxbelt as jb
 from jaxbelt.bifurcations.switch_folds import switch_band, switch_fold
-
-
-def nu0(osc):
-    return osc.belts[0].velocity
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +87,7 @@ def test_the_fold_is_differentiable(point):
     assert slope == pytest.approx(float(difference), rel=1e-6)
 
 
+@pytest.mark.slow(first=True)
 def test_what_is_no_such_fold_is_refused(point):
     hopf = jb.refine(jb.Hopf(), jb.presets.class_a(0.19), where=nu0)
     with pytest.raises(ValueError, match="point must be a nonsmooth fold"):

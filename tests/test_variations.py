@@ -11,18 +11,16 @@ import oracle
 import oracle_cycles
 import pytest
 from compilations import compilations
+from where import nu0
 
 import jaxbelt as jb
 from jaxbelt import Status
 from jaxbelt.model.parameters import leaf_index, vary
 from jaxbelt.model.variations import Variation
 
+FIRST = pytest.mark.slow(first=True)
 #: Where the fixed point of class (a) changes its stability, eq. (28) of the paper.
 HOPF = (np.sqrt(8) - 1) / 10
-
-
-def nu0(osc):
-    return osc.belts[0].velocity
 
 
 # --- what it makes --------------------------------------------------------------------------------
@@ -115,16 +113,21 @@ def shared_load(load, nu=0.54):
 @pytest.mark.parametrize(
     ("make", "at", "expected"),
     [
-        (lambda s: jb.presets.class_a(2 * s), 0.1, HOPF / 2),
-        (lambda s: jb.presets.class_a(s**2), 0.4, np.sqrt(HOPF)),
-        (lambda s: jb.presets.class_a(s**2), -0.4, -np.sqrt(HOPF)),
-        (lambda s: jb.presets.class_a(0.1 / s), 0.5, 0.1 / HOPF),
-        (lambda s: jb.presets.class_a(jnp.exp(-s)), 1.5, -np.log(HOPF)),
+        pytest.param(lambda s: jb.presets.class_a(2 * s), 0.1, HOPF / 2, id="half"),
+        pytest.param(lambda s: jb.presets.class_a(s**2), 0.4, np.sqrt(HOPF), id="root"),
+        pytest.param(lambda s: jb.presets.class_a(s**2), -0.4, -np.sqrt(HOPF), id="other root"),
+        pytest.param(lambda s: jb.presets.class_a(0.1 / s), 0.5, 0.1 / HOPF, id="inverse"),
+        pytest.param(lambda s: jb.presets.class_a(jnp.exp(-s)), 1.5, -np.log(HOPF), id="logarithm"),
         # Of both belts the slopes add up to the damping.
-        (shared_load, 0.6, 0.5 / (4 / 6.4**2 + 4 / 4.5**2)),
-        (lambda r: jb.presets.class_b(0.3, 0.3 * r), 0.5, (np.sqrt(4 / 0.25) - 1) / 3),
+        pytest.param(
+            shared_load, 0.6, 0.5 / (4 / 6.4**2 + 4 / 4.5**2), id="shared load", marks=FIRST
+        ),
+        pytest.param(
+            *(lambda r: jb.presets.class_b(0.3, 0.3 * r), 0.5, (np.sqrt(4 / 0.25) - 1) / 3),
+            id="ratio",
+            marks=FIRST,
+        ),
     ],
-    ids=["half", "root", "other root", "inverse", "logarithm", "shared load", "ratio"],
 )
 def test_hopf_points_in_closed_form(make, at, expected):
     point = jb.refine(jb.Hopf(), make, at=at)

@@ -11,13 +11,10 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import jaxbelt as jb
+from tests.where import nu0
 
 EXACT = 0.538734800481
 NU1 = 0.35
-
-
-def nu0(osc):
-    return osc.belts[0].velocity
 
 
 def test_one_fold(benchmark):

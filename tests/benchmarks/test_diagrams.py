@@ -10,14 +10,7 @@ import numpy as np
 import pytest
 
 import jaxbelt as jb
-
-
-def nu0(osc):
-    return osc.belts[0].velocity
-
-
-def nu1(osc):
-    return osc.belts[1].velocity
+from tests.where import nu0, nu1
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ import traceback
 from pathlib import Path
 
 from .cases import REGIMES, STRUCTURES
-from .outcome import Outcome, summed
+from .outcome import Outcome, part, summed
 
 #: Of which module each campaign is.
 CAMPAIGNS = {
@@ -70,24 +70,24 @@ def main(arguments=None):
 
     jax.config.update("jax_enable_x64", True)
     campaign = importlib.import_module(f".{CAMPAIGNS[options.what]}", __package__)
-    header = dict(what=options.what, seed=options.seed, **campaign.settings(options))
+    header = dict(what=options.what, seed=options.seed, **part(campaign, "settings")(options))
     results = Results(options.results, header)
-    numbers = campaign.numbers(options)
+    numbers = part(campaign, "numbers")(options)
     began = time.monotonic()
     with _stopping() as was_asked:
         _go_through(campaign, options, numbers, results, was_asked)
     done = [results.outcomes[n] for n in numbers if n in results.outcomes]
     wrong = sum(bool(one.wrong) for one in done)
     counts, largest = summed(done)
-    print(*campaign.said(counts, largest), sep="\n")
-    holds = getattr(campaign, "holds", lambda _: True)(counts)
+    said = part(campaign, "said")(counts, largest)
+    print(*said, sep="\n")
     print(
         f"{options.what}, seed {options.seed}: {len(done)} of {len(numbers)} cases, {wrong} wrong; "
         f"{time.monotonic() - began:.0f} s; commit {', '.join(sorted(results.commits))}"
     )
     if options.table:
-        put_rows(options.table, campaign.said(counts, largest))
-    return int(wrong > 0 or len(done) < len(numbers) or not holds)
+        put_rows(options.table, said)
+    return int(wrong > 0 or len(done) < len(numbers) or not part(campaign, "holds")(counts))
 
 
 def _go_through(campaign, options, numbers, results, was_asked):

@@ -32,14 +32,6 @@ def random_record(rng):
             return osc, seen
 
 
-def settings(options) -> dict:
-    return {}
-
-
-def numbers(options) -> range:
-    return range(options.runs)
-
-
 def outcome(options, number: int) -> Outcome:
     """Fit one record."""
     rng = np.random.default_rng((options.seed, number))

@@ -34,7 +34,16 @@ def outcome(options, number):
     rng = np.random.default_rng((options.seed, number))
     batch = [forced_cases.case(rng, structure) for _ in range(count)]
     told = forced_package.simulated(batch, options.tol)
-    one = Outcome(f"{count} runs of {structure}")
+    one = compared(batch, told, options)
+    following = _batches(options)[number + 1 : number + 2]
+    if not following or following[0][0] != structure:
+        _differentiate(one, structure, rng)
+    return one
+
+
+def compared(batch, told, options) -> Outcome:
+    """What was told of runs of one structure, beside the engine's."""
+    one = Outcome(f"{len(batch)} runs of {batch[0].structure}")
     verdicts = forced_cases.judged(batch, told, options.tol, options.threads)
     for case, answer, (verdict, mine) in zip(batch, told, verdicts):
         one.counts[f"{case.kind}|{verdict}|{options.what}|{options.tol:g}"] += 1
@@ -44,9 +53,6 @@ def outcome(options, number):
                 f"{answer.n_events} events; engine {mine.y_end} {mine.mode_end} {mine.status} "
                 f"{len(mine.t)} events, margin {mine.margin:.1e}\n  {case.to_json()}"
             )
-    following = _batches(options)[number + 1 : number + 2]
-    if not following or following[0][0] != structure:
-        _differentiate(one, structure, rng)
     return one
 
 

@@ -15,17 +15,14 @@ from jaxbelt.model.own_units import in_units_of_run
 from jaxbelt.sweeps import question
 
 from . import forced, forced_cases, forced_package
-from .outcome import Outcome
+from .forced_runs import compared
+from .forced_runs import settings as settings
 from .package import Final
 from .runs import said as said
 
 #: Runs in one call, and structures, each a compilation.
 BATCH, PROGRAMS = 1024, 12
 _SIZES = {"conti": 4, "coulomb": 2, "stribeck": 3, "cubic": 3}
-
-
-def settings(options):
-    return dict(runs=options.runs, tol=options.tol, structure=options.structure)
 
 
 def numbers(options):
@@ -40,17 +37,7 @@ def outcome(options, number):
     structure, count = _batches(options)[number]
     rng = np.random.default_rng((options.seed, number))
     batch = [from_zero(forced_cases.case(rng, structure)) for _ in range(count)]
-    told = finals(batch, options.tol)
-    one = Outcome(f"{count} runs of {structure}")
-    verdicts = forced_cases.judged(batch, told, options.tol, options.threads)
-    for case, answer, (verdict, mine) in zip(batch, told, verdicts):
-        one.counts[f"{case.kind}|{verdict}|{options.what}|{options.tol:g}"] += 1
-        if verdict not in forced_cases.GOOD:
-            one.wrong.append(
-                f"{verdict}: {answer}; engine {mine.y_end} {mine.mode_end} {mine.status} "
-                f"{len(mine.t)} events, margin {mine.margin:.1e}\n  {case.to_json()}"
-            )
-    return one
+    return compared(batch, finals(batch, options.tol), options)
 
 
 def from_zero(case):

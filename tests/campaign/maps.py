@@ -204,10 +204,6 @@ def _for_mirror(kind: type, condition):
     return kind(belts[0] if names == ["belt"] else belts) if names else kind()
 
 
-def settings(options) -> dict:
-    return {}
-
-
 def numbers(options) -> range:
     return range(len(PLANES))
 

@@ -1,12 +1,12 @@
 """What a case of a campaign gave: what does not agree, and numbers that are summed up.
 
-A campaign is a module with
+A campaign is a module with `outcome(options, number)`, one case, compared; and, where it is not
+what it is in `USUAL`, with
 
 - `settings(options)`: what decides its cases, beside their numbers and the seed;
 - `numbers(options)`: the numbers of its cases;
-- `outcome(options, number)`: one case, compared;
 - `said(counts, largest)`: how all of them are summed up, in lines;
-- where that can be wrong, too, `holds(counts)`: whether it is not.
+- `holds(counts)`: whether that is right.
 """
 
 from collections import Counter
@@ -26,6 +26,22 @@ class Outcome:
 
     def to_json(self):
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
+
+
+#: What of a campaign need not be written.
+USUAL = {
+    "settings": lambda options: {},
+    "numbers": lambda options: range(options.runs),
+    "said": lambda counts, largest: [
+        f"{n} {name.replace('|', ', ')}" for name, n in sorted(counts.items())
+    ],
+    "holds": lambda counts: True,
+}
+
+
+def part(campaign, name):
+    """A function of a campaign by its name."""
+    return getattr(campaign, name, USUAL.get(name))
 
 
 def summed(outcomes):

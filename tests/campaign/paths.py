@@ -577,7 +577,7 @@ def _both_sides(path: OwnPath, point, special, brute: Brute, report: Report) -> 
     if away < 1e-9 or at - away < first or at + away > last:
         return
     if point.kind == "HopfAtInfinity":
-        return  # tests/test_infinity.py has its closed forms
+        return  # tests/test_bifurcations.py has its closed forms
     if point.kind == "SaddleConnection":
         if not _part(brute.case, path.orbit(point), float(point.place[4]), at, away):
             report.wrong.append(f"no orbits part at {point!r}")
@@ -649,14 +649,6 @@ def _changes(case: Case) -> bool:
     return len(names) > 1
 
 
-def settings(options) -> dict:
-    return {}
-
-
-def numbers(options) -> range:
-    return range(options.runs)
-
-
 def outcome(options, number: int) -> Outcome:
     """Compare along one path."""
     case = case_of(options.seed, number)
@@ -680,7 +672,3 @@ def outcome(options, number: int) -> Outcome:
         undecided=report.undecided,
     )
     return one
-
-
-def said(counts, largest) -> list[str]:
-    return [f"{dict(counts)}"]

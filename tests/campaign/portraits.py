@@ -289,14 +289,6 @@ def _slope(osc: engine.Oscillator, cycle: jb.Cycle) -> float:
     return float((ends[1] - ends[0]) / (2e-6 * size))
 
 
-def settings(options) -> dict:
-    return {}
-
-
-def numbers(options) -> range:
-    return range(options.runs)
-
-
 def outcome(options, number: int) -> Outcome:
     """Compare one random portrait."""
     rng = np.random.default_rng((options.seed, number))
@@ -320,7 +312,3 @@ def outcome(options, number: int) -> Outcome:
     if wrong:
         wrong.insert(0, f"{package.oscillator(own.given(osc))!r}\n{told}\n{own}")
     return one
-
-
-def said(counts, largest) -> list[str]:
-    return [f"{dict(counts)}"]

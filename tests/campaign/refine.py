@@ -28,14 +28,6 @@ SAME = 1e-7
 GOOD = ("found", "between", "nearer")
 
 
-def settings(options) -> dict:
-    return {}
-
-
-def numbers(options) -> range:
-    return range(options.runs)
-
-
 def outcome(options, number: int) -> Outcome:
     """Ask beside all points of one path."""
     case = paths.case_of(options.seed, number)

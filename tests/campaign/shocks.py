@@ -177,14 +177,6 @@ def random_shock(rng: np.random.Generator):
             return kind, osc, y0, direction, shock
 
 
-def settings(options) -> dict:
-    return {}
-
-
-def numbers(options) -> range:
-    return range(options.runs)
-
-
 def outcome(options, number: int) -> Outcome:
     """Compare one random shock."""
     rng = np.random.default_rng((options.seed, number))

@@ -22,14 +22,6 @@ STEP, ROOM = 2e-4, 1e-5
 TOGETHER = 10
 
 
-def settings(options) -> dict:
-    return {}
-
-
-def numbers(options) -> range:
-    return range(options.runs)
-
-
 def outcome(options, number: int) -> Outcome:
     """Differentiate all points of one path."""
     case = paths.case_of(options.seed, number)
@@ -72,7 +64,3 @@ def _compared(case: paths.Case, osc, point, along):
     if np.isnan(told):
         return "none told", told, right
     return ("same" if abs(told - right) < ROOM * (1 + abs(right)) else "wrong"), told, right
-
-
-def said(counts, largest) -> list[str]:
-    return [f"{n} {name}" for name, n in sorted(counts.items())]

@@ -61,10 +61,6 @@ def _again(by, case, tol):
     return (package.labels([case], tol) if by == "sweep" else package.cycles([case]))[0]
 
 
-def said(counts, largest):
-    return [f"{n} {name.replace('|', ', ')}" for name, n in sorted(counts.items())]
-
-
 def case(rng, laws, *, is_round):
     """An oscillator of belts with these laws, and a start beside or on one of the boundaries."""
 

@@ -4,7 +4,6 @@ from collections import Counter
 from dataclasses import replace
 from itertools import pairwise
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,24 +12,14 @@ import oracle_cycles
 import pytest
 from laws import BELL, NESTED, bell, nested
 from scipy.optimize import brentq, minimize_scalar
+from where import nu0
 
 import jaxbelt as jb
 from jaxbelt import EventKind, Status
 from jaxbelt.bifurcations.conditions import CycleEquation
 from jaxbelt.bifurcations.path import ParameterPath
 from jaxbelt.bifurcations.scan import search
-from jaxbelt.cycles.attractors import distinct
-from jaxbelt.cycles.chains import loop_events
 from jaxbelt.model.parameters import leaf_index, vary
-
-
-def nu0(osc):
-    return osc.belts[0].velocity
-
-
-def nu1(osc):
-    return osc.belts[1].velocity
-
 
 # Class (b), nu1 = 0.35: the paper's seven points and the one that it misses, see test_bifurcations.
 POINTS = [
@@ -138,6 +127,7 @@ def crossing():
     return jb.scan(held_by(0.3)[0], load1, (0.1, 0.5), resolution=48)
 
 
+@pytest.mark.slow(first=True)
 def test_crossing_sliding(crossing):
     """At the end of slip onset, where a phase of no duration begins, and at the other end."""
     assert [point.condition for point in crossing] == [jb.CrossingSliding(1)] * 2
@@ -195,42 +185,6 @@ def test_a_fold_of_an_orbit_that_repels_strongly():
     assert point.value == pytest.approx(expected, abs=1e-10) and point.error < 1e-10
 
 
-def two_cycles(nu):
-    """Class (d): a cycle to either side of where belt 1 begins, both of which stick to belt 0."""
-    return jb.presets.class_d(nu, 0.5073, -0.49694, 0.61855)
-
-
-@pytest.mark.slow(first=True)
-def test_two_cycles_with_one_sequence_of_events():
-    """One of them begins as it just touches the edge of belt 1, where belt 0 would hold it back."""
-    path = ParameterPath(two_cycles(-0.06341), nu0, (-0.3, -0.02))
-    points = search(path)
-    expected = [jb.SaddleConnection(1, to=1), jb.GrazingEdge(1), jb.Hopf(), jb.Hopf()]
-    assert [point.condition for point in points] == expected
-    path.find_labels([-0.06341])
-    loops = [one.loop for one in path.cycles[-0.06341]]
-    assert len({loop_events(loop) for loop in loops}) == 1
-    assert sorted(np.sum(loop.durations) for loop in loops) == pytest.approx(
-        [9.9148027860, 10.9019400715], abs=1e-7
-    )
-    # By simulation: how many cycles there are just before and just after.
-    starts = [(x1, -0.1) for x1 in np.linspace(-1.5, 1.5, 13)]
-    for offset, count in ((-1e-5, 1), (1e-5, 2)):
-        osc = two_cycles(float(points[1].value) + offset)
-        assert len(distinct([jb.find_cycle(osc, start) for start in starts])) == count
-
-
-@pytest.mark.slow(first=True)
-def test_a_corner_where_only_the_sign_of_what_arrives_changes():
-    """Belt 1 begins where the mass sticks to belt 0 before the point, and slips on it after."""
-    law = jb.Conti(1.09, 0.42, 12.8)
-    belts = (jb.Belt(0.4, law, 0.8, upper=0.9), jb.Belt(0.291, law, lower=0.72))
-    points = jb.scan(jb.Oscillator(0.374, belts), nu0, (0.38, 0.44))
-    expected = [jb.CornerCollision(1), jb.CornerCollision(1), jb.GrazingEdge(1)]
-    assert [point.condition for point in points] == expected
-    assert points[1].value == pytest.approx(0.398440689452, abs=1e-11)
-
-
 @pytest.mark.slow
 def test_an_orbit_that_still_grows_is_no_cycle():
     """From beside an unstable equilibrium it takes hundreds of arcs until it first sticks."""
@@ -242,13 +196,6 @@ def test_an_orbit_that_still_grows_is_no_cycle():
     path = ParameterPath(osc, lambda osc: osc.belts[1].velocity, (0.932, 0.935))
     path.find_labels([0.9333, 0.93331195])
     assert [len(path.cycles[value]) for value in (0.9333, 0.93331195)] == [1, 1]
-
-
-def test_nothing_happens_where_a_belt_without_load_is_as_fast():
-    osc = jb.presets.class_b(0.2, 0.22)
-    osc = eqx.tree_at(lambda osc: osc.belts[1].load, osc, 0.0)
-    kinds = [point.kind for point in jb.scan(osc, nu0, (0.2, 0.25))]
-    assert kinds == []
 
 
 @pytest.mark.slow
@@ -276,16 +223,6 @@ def test_nested_cycles_in_one_mode():
     assert [len(sizes) for sizes in amplitudes] == [1, 2, 1]
     # To first order in the damping less 0.5, so up to some per cent.
     assert sorted(amplitudes[1]) == pytest.approx([0.2, 0.4], rel=0.02)
-
-
-def test_a_belt_without_load_changes_nothing():
-    """Neither where it is at rest, nor where a cycle touches its boundary."""
-    belt = jb.Belt(0.3, jb.Conti(1.0, 0.6, 10.0))
-    idle = jb.Belt(0.1, jb.Conti(1.0, 0.6, 10.0), load=0.0)
-    osc = jb.Oscillator(0.5, (belt, idle))
-    assert jb.scan(osc, nu1, (-0.1, 0.2), resolution=16) == ()
-    kinds = [point.kind for point in jb.scan(osc, nu0, (0.15, 0.3), resolution=16)]
-    assert kinds == ["Hopf", "NonsmoothFold"]
 
 
 def bell_oracle(nu):
@@ -450,16 +387,6 @@ def test_a_search_that_is_left_says_so(monkeypatch):
     assert any(point.status == Status.OK for point in points)
 
 
-@pytest.mark.slow(first=True)
-def test_what_kinetic_friction_stops_comes_to_the_edge_of_a_segment():
-    """Belt 0 at rest holds the mass up to 1, but slipping on it takes 0.7 only: the part of the
-    segment of equilibria below -0.7 holds but attracts nothing."""
-    osc = jb.Oscillator(0.5, (jb.Belt(0.0, jb.Coulomb(1.0, 0.7), upper=-0.6),))
-    (point,) = jb.scan(osc, lambda osc: osc.belts[0].upper, (-0.9, -0.5), resolution=8)
-    assert point.condition == jb.BoundaryEquilibrium(0) and point.type == "annihilation"
-    assert point.value == pytest.approx(-0.7, abs=1e-14)
-
-
 @pytest.mark.parametrize(
     ("span", "message"),
     [
@@ -509,242 +436,6 @@ def test_simulation_agrees_between_any_two_points():
             assert tuple(np.flatnonzero(place[0])) == tuple(sorted(belts)) and seen <= allowed
 
 
-@pytest.mark.slow(first=True)
-def test_two_cycles_at_one_value_are_two_points():
-    """Each is the other turned round, in the same contact interval of a light belt at rest: at its
-    ends they collide with a corner at one value."""
-    law, light = jb.Conti(1.0, 0.6, 10.0), jb.Coulomb(0.5, 0.5)
-    light = jb.Belt(0.0, light, load=0.02, lower=-1.03, upper=1.03)
-
-    def make(nu):
-        return jb.Oscillator(
-            0.5, (jb.Belt(-nu, law, upper=-0.1), jb.Belt(nu, law, lower=0.1), light)
-        )
-
-    left, right = jb.scan(make, span=(0.188, 0.192), resolution=8)
-    assert left.condition == right.condition == jb.CornerCollision(2)
-    assert left.value == pytest.approx(float(right.value), abs=1e-12)
-    assert left.cycle.x1_min == pytest.approx(-1.03, abs=1e-12)
-    assert right.cycle.x1_max == pytest.approx(1.03, abs=1e-12)
-
-
-def _edge_beside_the_equilibrium(distance):
-    """v: an oscillator with an edge so far to the right of where the mass is at rest on a belt."""
-    conti = jb.Conti(static=1.0, residual=0.6, steepness=10.0)
-
-    def at(v):
-        lower = 0.4 / (1 + 10 * v) + 0.6 + distance(v)
-        return jb.Oscillator(0.5, (jb.Belt(v, conti), jb.Belt(0.5, conti, lower=lower)))
-
-    return at
-
-
-@pytest.mark.slow(first=True)
-def test_what_holds_all_along_is_no_point():
-    # Rounding decides on which side the edge is; what is added makes it do so on any machine.
-    at = _edge_beside_the_equilibrium(lambda v: 4e-16 * jnp.sin(1e3 * v))
-    assert jb.refine(jb.BoundaryEquilibrium(1), at, at=0.23).status == Status.DEGENERATE
-    (hopf,) = jb.scan(at, span=(0.22, 0.24), resolution=4)
-    assert hopf.kind == "Hopf"
-    diagram = jb.bifurcation_diagram(at, span=(0.22, 0.24), resolution=4, rows=16)
-    assert [b for _, b, _ in diagram.regions] == [pytest.approx(float(hopf.value)), 0.24]
-
-
-@pytest.mark.slow(first=True)
-@pytest.mark.parametrize("distance", [0.0, 1e-15, -1e-15, 1e-9])
-def test_a_fixed_point_on_an_edge_all_along_has_a_hopf_point(distance):
-    """Its trace is that of the second belt, 0.4 / 0.5 exp(-0.8 / 0.5) - damping, and the edge of
-    the first one lies on it: on the other side that belt's force is missing, and pushes back."""
-    stribeck, held = jb.Stribeck(1.0, 0.6, 0.5), 0.4 * np.exp(-1.6) + 0.6
-    for turned in (False, True):
-        edge = (0.75 - held - distance) if turned else (held - 0.75 + distance)
-        own = jb.Coulomb(0.75, 0.75)
-        ends = dict(upper=edge) if turned else dict(lower=edge)
-        sign = -1.0 if turned else 1.0
-        belts = jb.Belt(-sign * 0.3, own, **ends), jb.Belt(sign * 0.8, stribeck)
-        osc = jb.Oscillator(0.2, belts)
-        points = jb.scan(osc, lambda osc: osc.damping, span=(0.0, 0.4), resolution=8)
-        kind = "PseudoHopf" if distance > 1e-12 else "Hopf"
-        assert {point.kind for point in points} == {kind, "CornerCollision", "NonsmoothFold"}
-        (hopf,) = [point for point in points if point.kind == kind]
-        assert hopf.value == pytest.approx(0.8 * np.exp(-1.6), abs=1e-13)
-        if kind == "Hopf":
-            assert hopf.type == "degenerate" and np.isnan(hopf.coefficient)
-
-
-@pytest.mark.slow(first=True)
-def test_nothing_happens_where_a_belt_reverses_at_a_pseudo_focus_that_attracts():
-    """It pushes to the right with 0.5 +- 0.125 there, and the other one back with 0.3."""
-
-    def make(v):
-        own = jb.Belt(v, jb.Coulomb(1, 0.5), 0.25, upper=-0.5)
-        return jb.Oscillator(1.0, (own, jb.Belt(-1.0, jb.Coulomb(1, 0.8), lower=-0.5)))
-
-    for v in (-0.1, 0.1):
-        (row,) = jb.equilibria(make(v))
-        assert row.kind == jb.EquilibriumKind.PSEUDO_FOCUS and row.stable
-    assert jb.scan(make, span=(-0.3, 0.4), resolution=14) == ()
-
-
-def test_edges_that_are_one_all_along_do_not_meet():
-    conti = jb.Conti(static=1.0, residual=0.6, steepness=10.0)
-
-    def at(v):
-        belts = jb.Belt(v, conti, upper=0.5), jb.Belt(0.35, conti, lower=0.5)
-        return jb.Oscillator(0.5, belts)
-
-    assert jb.refine(jb.MeetingEdges((0, 1)), at, at=0.3).status == Status.DEGENERATE
-
-
-def _edge_at_the_least_friction(v):
-    # At v = 0.3: 2 q v = 4 / (1 + 10 v)^2.
-    quadratic = 0.25 / 0.6
-    conti = jb.Conti(static=1.0, residual=0.6, steepness=10.0, quadratic=quadratic)
-    edge = 0.7 + quadratic * 0.09
-    return jb.Oscillator(0.5, (jb.Belt(v, conti), jb.Belt(0.5, conti, lower=edge)))
-
-
-@pytest.mark.parametrize("start", [0.26, 0.2999, 0.33])
-def test_the_error_of_a_double_root_is_told(start):
-    osc = _edge_at_the_least_friction(start)
-    point = jb.refine(jb.BoundaryEquilibrium(1), osc, where=lambda osc: osc.belts[0].velocity)
-    assert point.status != Status.OK or abs(point.value - 0.3) <= point.error
-
-
-@pytest.mark.parametrize("unit", [1e3, pytest.param(1e-3, marks=pytest.mark.slow(first=True))])
-def test_the_unit_of_the_parameter_makes_no_difference(unit):
-    along = _edge_beside_the_equilibrium(lambda v: 4e-16 * jnp.sin(1e3 * v))
-    found = jb.scan(lambda s: along(s / unit), span=(0.22 * unit, 0.24 * unit), resolution=4)
-    assert [point.kind for point in found] == ["Hopf"]
-    # A double root, known to 5e-8 units, and a simple one, from farther off than 0.5.
-    double = jb.refine(
-        jb.BoundaryEquilibrium(1), lambda s: _edge_at_the_least_friction(s / unit), at=0.2999 * unit
-    )
-    assert double.status == Status.OK and double.error < 1e-6 * unit
-    assert abs(double.value - 0.3 * unit) <= double.error
-    hopf = jb.refine(jb.Hopf(), lambda s: jb.presets.class_b(s / unit, 0.35), at=0.25 * unit)
-    assert hopf.value == pytest.approx(0.263654916039 * unit, rel=1e-11)
-    assert hopf.error < 1e-13 * unit
-
-
 def test_a_span_that_is_hardly_longer_than_a_point():
     (rest,) = jb.scan(lambda nu: jb.presets.class_b(nu, 0.35), span=(-5e-7, 5e-7))
     assert rest.kind == "SuddenSliding" and abs(rest.value) < 1e-14
-
-
-@pytest.mark.parametrize("varied", ["velocity", "damping"])
-def test_two_equilibria_that_change_at_one_value(varied):
-    """A mirror image of itself: two fixed points, the same distance from the middle."""
-    law = jb.Conti(static=1.0, residual=0.6, steepness=10.0)
-
-    def of_both(speed, damping):
-        belts = jb.Belt(speed, law, lower=0.1), jb.Belt(-speed, law, upper=-0.1)
-        return jb.Oscillator(damping, belts)
-
-    # Eq. (28) of the paper: damping = (static - residual) steepness / (1 + steepness speed)^2.
-    if varied == "velocity":
-        make, exact = (lambda speed: of_both(speed, 0.5)), (np.sqrt(8) - 1) / 10
-    else:
-        make, exact = (lambda damping: of_both(0.2, damping)), 4 / 9
-    points = jb.scan(make, span=(exact - 0.03, exact + 0.03), resolution=4)
-    at = [float(point.x1) for point in points]
-    rest = 0.6 + 0.4 / (1 + 10 * (exact if varied == "velocity" else 0.2))
-    assert [point.kind for point in points] == ["Hopf", "Hopf"]
-    assert np.allclose(sorted(at), [-rest, rest], rtol=0, atol=1e-12)
-    assert all(float(point.value) == pytest.approx(exact, abs=1e-13) for point in points)
-    assert all(point.place[:2] == pytest.approx(x1) for point, x1 in zip(points, at))
-    if varied == "velocity":
-        for point in points:
-            curve = jb.bifurcation_curve(point, of_both, span=((0.15, 0.22), (0.4, 0.6)))
-            assert np.all(np.sign(curve.places[:, 0]) == np.sign(float(point.x1)))
-
-
-@pytest.mark.slow(first=True)
-@pytest.mark.parametrize("span", [(0.0, 0.5), (-0.5, 0.0)])
-def test_nothing_happens_where_a_load_vanishes(span):
-    law = jb.Conti(1.0, 0.6, 10.0)
-
-    def make(value):
-        return jb.Oscillator(
-            0.25, (jb.Belt(0.3, law, jnp.abs(value), upper=0.6), jb.Belt(0.1, law))
-        )
-
-    assert jb.scan(make, span=span, resolution=8) == ()
-
-
-@pytest.mark.slow(first=True)
-@pytest.mark.parametrize("damping", [0.5, 2.0])
-def test_an_edge_that_stays_on_the_fixed_point_is_no_point(damping):
-    """All loads and edges grow alike, on round numbers, and the fixed point with them."""
-    law = jb.Conti(1.0, 0.6, 10.0)
-
-    def make(size):
-        belts = (
-            jb.Belt(0.1, law, size, upper=0.15 * size),
-            jb.Belt(-0.7, law, size, lower=-0.5 * size),
-        )
-        return jb.Oscillator(damping, belts)
-
-    assert jb.scan(make, span=(0.5, 1.5), resolution=16) == ()
-
-
-def test_a_belt_at_rest_that_holds_nothing_hides_no_hopf_point():
-    """Without a load it is no obstacle, though the fixed point lies on its boundary."""
-    law = jb.Conti(1.0, 0.6, 10.0)
-
-    def make(nu):
-        return jb.Oscillator(2.0, (jb.Belt(0.0, law, 0.0), jb.Belt(nu, law)))
-
-    for at in (0.0414, -0.0414):
-        point = jb.refine(jb.Hopf(), make, at=at)
-        assert int(point.status) == Status.OK and point.type == "subcritical"
-        # 0.4 * 10 / (1 + 10 nu)^2 = damping
-        assert abs(float(point.value)) == pytest.approx((np.sqrt(2) - 1) / 10, abs=1e-14)
-
-
-@pytest.mark.slow(first=True)
-def test_the_edges_of_a_belt_without_load_do_not_cut_what_a_belt_at_rest_holds():
-    """Two belts at rest share an edge, which moves past those of a third one, without load."""
-    law = jb.Conti(1.0, 0.6, 5.0)
-
-    def make(edge):
-        held = jb.Belt(0.0, law, 2.0, upper=edge), jb.Belt(0.0, law, 2.0, lower=edge)
-        return jb.Oscillator(0.1, (*held, jb.Belt(0.0, law, 0.0, -0.4, 0.3)), 0.5)
-
-    assert jb.scan(make, span=(-0.8, 0.8)) == ()
-
-
-@pytest.mark.slow
-def test_no_cycle_has_a_corner_at_the_edge_of_a_belt_without_load():
-    """Just behind a nonsmooth fold such a corner explained what the fold did."""
-    laws = [jb.Conti(1.2811147144765658, 0.472216266800267, 10.917368501350285, 0.034743528)]
-    laws += [jb.Conti(0.834101590979167, 0.4631886527969489, 3.8869198626736416, 0.003869525)]
-    belts = (
-        jb.Belt(0.23652667037415237, laws[0], 0.512709939622697, lower=-0.9319060589307261),
-        jb.Belt(-0.7681793591458714, laws[1], 0.8449201209243598, upper=-0.49536973697455766),
-        jb.Belt(-0.7681793591458714, laws[1], 0.0, -0.4, 0.3),
-    )
-    osc = jb.Oscillator(0.6225516228351654, belts, 1.8185890197174717)
-    points = jb.scan(osc, lambda osc: osc.belts[0].load, (0.25, 1.5))
-    assert [point.kind for point in points] == ["NonsmoothFold", "Hopf"]
-
-
-@pytest.mark.slow(first=True)
-def test_a_belt_whose_load_is_zero_in_the_middle_of_the_path_has_its_edges():
-    """Both sides of that are images of one another, and as a path of one side tells them."""
-    law = jb.Conti(1.0, 0.6, 10.0)
-
-    def make(s):
-        belts = jb.Belt(0.3, law), jb.Belt(-0.2, law, jnp.abs(s), upper=0.8)
-        return jb.Oscillator(0.3, belts)
-
-    def told(first, last):
-        points = jb.scan(make, span=(first, last))
-        return [(one.kind, float(one.value)) for one in points if abs(float(one.value)) > 0.4]
-
-    one_side = told(0.4, 0.55)
-    assert [kind for kind, _ in one_side] == ["CornerCollision", "GrazingEdge"]
-    both = told(-0.55, 0.55)
-    expected = [(kind, -value) for kind, value in reversed(one_side)] + one_side
-    assert [kind for kind, _ in both] == [kind for kind, _ in expected]
-    assert [value for _, value in both] == pytest.approx([v for _, v in expected], abs=1e-9)

@@ -1,7 +1,6 @@
 """`attractors`: which there are at each point of a sweep over starts, and how many lead to each."""
 
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import xarray as xr
@@ -39,7 +38,6 @@ def test_attractors_and_fractions_are_those_of_basins(dataset):
 def test_they_can_be_drawn_and_written(dataset, tmp_path):
     found = jb.attractors(dataset)
     found.kind.isel(nu1=0).plot()
-    plt.close("all")
     found.to_netcdf(tmp_path / "a.nc", engine="scipy")
     found.to_zarr(tmp_path / "a.zarr", consolidated=False)
     read = xr.open_dataset(tmp_path / "a.nc", engine="scipy")

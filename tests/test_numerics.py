@@ -1,4 +1,4 @@
-"""Pseudo-arclength on curves whose equations are known, and every way in which one can end."""
+"""Curves whose equations are known, every way in which one can end; and even values."""
 
 import functools
 
@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jaxbelt.numerics.continuation import Stop, continue_curve, corrected
+from jaxbelt.numerics.spacing import evenly_spaced
 
 # Points solve their equation to rounding; Newton's method ends below this.
 ROUNDING = 1e-12
@@ -117,3 +118,20 @@ def test_impossible_arguments_are_named(arguments, message):
     given = {"start": (2.0, 0.0), "direction": (0.0, 1.0), **arguments}
     with pytest.raises(ValueError, match=message):
         list(continue_curve(circle(2.0), given.pop("start"), given.pop("direction"), **given))
+
+
+# --- even values of a parameter -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [3, 5, 61, 101, 141, 1001])
+@pytest.mark.parametrize("ends", [(-0.7, 0.7), (-1.1, 1.1), (-1 / 3, 1 / 3)])
+def test_the_middle_of_a_symmetric_span_is_zero(ends, n):
+    values = evenly_spaced(*ends, n)
+    assert values[n // 2] == 0 and np.array_equal(values, -values[::-1])
+
+
+@pytest.mark.parametrize("n", [1, 2, 7, 100])
+def test_it_is_as_even_as_numpy(n):
+    values = evenly_spaced(0.1, 2.3, n)
+    np.testing.assert_allclose(values, np.linspace(0.1, 2.3, n), rtol=4e-16)
+    assert values[0] == 0.1 and values[-1] == (2.3 if n > 1 else 0.1)
