@@ -288,7 +288,7 @@ def _meeting(curve: Polynomial, doubt, rounding, ends, h, room, reach, number) -
     `step.LANDS_WITHIN`."""
     (_, slope0), (value, slope) = ends
     met = passage(curve, doubt, rounding, h < SHORTEST_TIMED_STEP * reach)
-    bend = (slope - slope0) * _inverse(h)
+    bend = (slope - slope0) * _per_step(h)
     falls = slope < 0
     near = jnp.abs(value) * jnp.maximum(-slope, SLOW * jnp.abs(bend)) <= reach * slope * slope
     straight = value * value * jnp.abs(bend) * h <= room * slope * slope
@@ -303,7 +303,7 @@ def _meeting(curve: Polynomial, doubt, rounding, ends, h, room, reach, number) -
     )
 
 
-def _inverse(h: Array) -> Array:
+def _per_step(h: Array) -> Array:
     """1/h of the lanes that make a step: one division serves all guards."""
     return 1.0 / jnp.where(h > 0, h, 1.0)
 
@@ -314,7 +314,7 @@ def _quartic(start, end, change, h) -> list[Array]:
     (f0, s0), (f1, s1) = start, end
     m0, m1 = h * s0, h * s1
     rise = f1 - f0
-    k4 = 30 * (change * _inverse(h) - 0.5 * (f0 + f1) - (m0 - m1) / 12)
+    k4 = 30 * (change * _per_step(h) - 0.5 * (f0 + f1) - (m0 - m1) / 12)
     k4 = jnp.where(h < SHORT_TIMED_STEP, 0.0, k4)
     c2, c3 = 3 * rise - 2 * m0 - m1, m0 + m1 - 2 * rise
     return [f0, m0, c2 + k4, c3 - 2 * k4, k4]

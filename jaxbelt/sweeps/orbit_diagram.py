@@ -63,7 +63,7 @@ OUTSIDE = 1e-4
 #: the attractor of a neighbouring value, and points that are kept.
 PERIODS_LEFT_OUT, PERIODS_LEFT_OUT_BESIDE, STROBES = 1000, 500, 64
 #: Lanes of a run that begins where another one has ended.
-FEW_LANES = 4
+LANES_OF_FEW = 4
 #: Such a run begins so far from an equilibrium or a periodic forced motion, in own units: these may
 #: have become unstable, and a run that begins on one would stay.
 OFF_ATTRACTOR = 1e-3
@@ -365,7 +365,7 @@ class Sampling:
             note_progress(f"{i} of {self.rows} values")
             row = [i if sense == "up" else self.rows - 1 - i for sense in self.senses]
             which = np.array(row) * len(lanes) + lanes
-            few = {"width": FEW_LANES, **numbers}
+            few = {"width": LANES_OF_FEW, **numbers}
             for name, values in self._results(grid, observer, states, t1, which, **few).items():
                 shape = self.rows * len(lanes), *values.shape[1:]
                 found.setdefault(name, np.full(shape, np.nan))[which] = values
