@@ -124,6 +124,21 @@ def test_a_branch_ends_where_a_mass_begins_to_stick_by_grazing():
         assert away[0] < 0.01 and away[1] > 0.1
 
 
+@pytest.mark.slow
+def test_a_branch_of_twice_the_periods_ends_where_it_left():
+    """Behind the period doubling its own motions would come again, half of their periods later."""
+    start = jb.find_cycle(twins(2.15), (0.65, 0.6))
+    diagram = jb.bifurcation_diagram(twins(2.15), amplitude_of, (2.145, 2.16), rows=8, start=start)
+    assert not diagram.open_ends
+    (point,) = (point for point in diagram.points if point.kind == "PeriodDoubling")
+    branch, doubled = diagram.branches
+    assert {motion.periods for motion in doubled.cycles} == {4}
+    assert {motion.periods for motion in branch.cycles} == {2}
+    # It is left at a thousandth of the span at most, and the other end is one of the span.
+    away = np.abs(doubled.values[[0, -1]] - float(point.value))
+    assert np.min(away) < 0.001 * 0.015 and np.max(away) > 0.005
+
+
 def test_motions_and_multipliers_are_those_of_the_engine(smooth, sticking):
     # Differences of runs at 1e-13; the state is 3e-5 from grazing, so the step is small.
     for motion, frequency, h in ((smooth, 1.7079, 1e-6), (sticking, 1.68, 1e-4)):

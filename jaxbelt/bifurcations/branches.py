@@ -36,6 +36,7 @@ from .forced import (
     PeriodDoubling,
     SwitchingSliding,
     Torus,
+    motion_between_halves,
 )
 from .systems import WEIGHT
 from .tangencies import GrazingSliding
@@ -55,6 +56,10 @@ MOST_MOTIONS = 400
 BEYOND_POINT = (1e-5, 1e-4, 1e-3)
 #: States that a branch reaches beyond a point are no farther than this from it.
 NEAR_POINT = 0.1
+#: Of two motions that follow one another the way between them is straight up to this part.
+STRAIGHT_WAY = 0.1
+#: States of a motion half of its periods later that differ by less: a period doubling is near.
+ALIKE_HALVES = 0.03
 #: How far along the direction that a period doubling shows the motion that leaves is looked for.
 LEAVES = (1e-3, 1e-2, 5e-2)
 
@@ -67,10 +72,12 @@ class MotionRow(NamedTuple):
 
 
 class MotionBranch(NamedTuple):
-    """Motions along a branch, and values inside of the span at which it ends without a point."""
+    """Motions along a branch, and values inside of the span at which it ends without a point; a
+    closed one comes back to its first motion."""
 
     rows: list[MotionRow]
     open_ends: list[float]
+    is_closed: bool = False
 
 
 class ForcedLine(NamedTuple):
@@ -98,7 +105,9 @@ def forced_branches(
     branches, found, waiting = [], [], [(MotionRow(value, start), True)]
     while waiting:
         row, is_first = waiting.pop(0)
-        sides = [_side_of_point(line, row, sign) for sign in (-1.0, 1.0)]
+        sides = [_side_of_point(line, row, -1.0)]
+        around = sides[0][0].is_closed
+        sides += [(MotionBranch([row], []), [])] if around else [_side_of_point(line, row, 1.0)]
         behind, ahead = (side for side, _ in sides)
         ends = [*behind.open_ends, *ahead.open_ends]
         branches.append(MotionBranch([*reversed(behind.rows[1:]), *ahead.rows], ends))
@@ -184,9 +193,11 @@ def _side_of_point(
     rows, points = [row], []
     while len(rows) < MOST_MOTIONS:
         note_progress(f"{len(rows)} motions on one side")
-        ahead, found, further = _branch_leg(line, rows[-1], sign)
+        ahead, found, further = _branch_leg(line, rows[-1], sign, row)
         rows += ahead
         points += found
+        if rows[-1] is row and len(rows) > 1:
+            return MotionBranch(rows, [], is_closed=True), points
         if further is None:
             return MotionBranch(rows, []), points
         if not isinstance(further, tuple):
@@ -197,13 +208,14 @@ def _side_of_point(
 
 
 def _branch_leg(
-    line: ForcedLine, row: MotionRow, sign: float
+    line: ForcedLine, row: MotionRow, sign: float, home: MotionRow
 ) -> tuple[list[MotionRow], list[BifurcationPoint], tuple[MotionRow, float] | float | None]:
     """The motions after a row with its signature, the points on the way, and how it goes on.
 
     Where the signature ends that is the first motion with another one, and the sense in which the
-    parameter goes from it. It is None where the branch leaves the span, or ends in a point, and a
-    value where it ends otherwise.
+    parameter goes from it. It is None where the branch leaves the span, or ends in a point (also
+    where it comes back to the branch that it has left in a period doubling), or has come back to
+    the motion at home, which is then its last row; and a value where it ends otherwise.
     """
     leg, begun = MotionLeg.begun(line, row)
     if not begun.found:
@@ -221,6 +233,9 @@ def _branch_leg(
             end = line.first if new.value < line.first else line.last
             rows += _at_end(leg, u, solved.u, end, line)
             return rows, points, None
+        doubling = _doubling_between(line, last, new)
+        if doubling is not None:
+            return rows, [*points, doubling], None
         if int(new.motion.status) != Status.OK:
             start = leg.start(solved.u)
             if step < SEARCH_AGAIN * searched:
@@ -234,6 +249,8 @@ def _branch_leg(
             step, straight = 0.5 * step, 0
             continue
         points += list(_points_between(line, last, new))
+        if home is not last and _is_on_the_way(home, last, new):
+            return [*rows, home], points, None
         rows.append(new)
         straight += 1
         # Towards a border steps become shorter and shorter.
@@ -304,6 +321,50 @@ def _is_between(
     reach = 2 * abs(value - one.value) + 2 * LONGEST_STEP_OF_BRANCH * line.length
     away = np.max(np.abs(np.asarray(point.cycle.start) - np.asarray(one.motion.start)))
     return abs(float(point.value) - one.value) <= reach and bool(away <= 5 * apart + 0.01)
+
+
+def _doubling_between(line: ForcedLine, last: MotionRow, new: MotionRow) -> BifurcationPoint | None:
+    """The period doubling in which a branch ends between two of its motions: behind it come its own
+    motions again, half of their periods later. So it has been passed where the halves of the new
+    one have changed places; and it is near where those of the last one are alike, and the new one
+    is not known, for Newton's method is singular there."""
+    halves = _apart(last.motion)
+    if halves is None:
+        return None
+    is_known = int(new.motion.status) == Status.OK
+    ahead = _apart(new.motion) if is_known else None
+    if is_known and (ahead is None or np.sum(halves * ahead) >= 0):
+        return None
+    size = np.max(np.abs(halves))
+    if not is_known and size > ALIKE_HALVES:
+        return None
+    between = motion_between_halves(line.at(last.value), last.motion, line.turns)
+    if between is None:
+        return None
+    found = _points(line, PeriodDoubling(), MotionRow(last.value, between))
+    middle = np.mean(np.asarray(last.motion.starts)[:: last.motion.periods // 2], axis=0)
+    near = [p for p in found if np.max(np.abs(np.asarray(p.cycle.start) - middle)) < size]
+    return near[0] if near else None
+
+
+def _is_on_the_way(one: MotionRow, last: MotionRow, new: MotionRow) -> bool:
+    """Whether a motion is one between two others that follow one another on a branch."""
+    change, periods = new.value - last.value, last.motion.periods
+    if change == 0 or one.motion.periods != periods or new.motion.periods != periods:
+        return False
+    part = (one.value - last.value) / change
+    at, before, after = (np.asarray(row.motion.starts) for row in (one, last, new))
+    way = after - before
+    away = np.max(np.abs(at - before - part * way))
+    return bool(0 <= part <= 1 and away <= STRAIGHT_WAY * np.max(np.abs(way)))
+
+
+def _apart(motion: PeriodicMotion) -> np.ndarray | None:
+    """How far the states at the phase 0 are from those half of the periods later, [periods, 2];
+    None where these are odd."""
+    half, odd = divmod(motion.periods, 2)
+    starts = np.asarray(motion.starts)
+    return None if odd else starts - np.roll(starts, -half, axis=0)
 
 
 def _past_phase(
@@ -386,6 +447,9 @@ def _leaving(line: ForcedLine, point: BifurcationPoint) -> MotionRow | None:
             for angle in np.linspace(0, np.pi, 4, endpoint=False):
                 guess = at + size * np.array([np.cos(angle), np.sin(angle)])
                 motion = periodic_from(osc, guess, periods, line.turns)
-                if int(motion.status) == Status.OK and motion.periods == periods:
-                    return MotionRow(there, motion)
+                row = MotionRow(there, motion)
+                fine = int(motion.status) == Status.OK and motion.periods == periods
+                # Too near to the point the equations are singular.
+                if fine and MotionLeg.begun(line, row)[1].found:
+                    return row
     return None

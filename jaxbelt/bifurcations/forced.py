@@ -268,13 +268,20 @@ def motions_to_begin_from(osc: OwnOscillator, start: Any, turns: int) -> Sequenc
         found = [motion] if int(motion.status) == Status.OK else []
     else:
         found = motions_of(osc, STARTS_OF_MOTIONS, turns)
-    for motion in list(found):
-        half, odd = divmod(motion.periods, 2)
-        if not odd:
-            starts = np.asarray(motion.starts)
-            between = periodic_from(osc, 0.5 * (starts[0] + starts[half]), half, turns)
-            found += [between] if int(between.status) == Status.OK else []
-    return found
+    between = [motion_between_halves(osc, motion, turns) for motion in found]
+    return found + [motion for motion in between if motion is not None]
+
+
+def motion_between_halves(
+    osc: OwnOscillator, motion: PeriodicMotion, turns: int
+) -> PeriodicMotion | None:
+    """The motion of half as many periods from which one may have left in a period doubling."""
+    half, odd = divmod(motion.periods, 2)
+    if odd:
+        return None
+    starts = np.asarray(motion.starts)
+    between = periodic_from(osc, 0.5 * (starts[0] + starts[half]), half, turns)
+    return between if int(between.status) == Status.OK else None
 
 
 # --- multipliers ----------------------------------------------------------------------------------
