@@ -69,6 +69,61 @@ def test_the_number_of_periods_is_the_least(frequency):
     assert np.max(np.abs(start - once)) > 0.1 and start == pytest.approx(twice, abs=1e-9)
 
 
+TWINS = (("conti", 1.0, 0.6, 10.0, 0.0), ("coulomb", 1.0, 0.8))
+
+
+def twins(amplitude):
+    """Two belts of one velocity; the second one's friction falls when the mass begins to slip."""
+    laws = jb.Conti(*TWINS[0][1:]), jb.Coulomb(*TWINS[1][1:])
+    belts = jb.Belt(-1.0, laws[0], 2.0), jb.Belt(-1.0, laws[1], 1.5)
+    return jb.Oscillator(0.1, belts, forcing=jb.Harmonic(amplitude, 0.5, 1.5 * np.pi))
+
+
+def twins_of_engine(amplitude):
+    belts = tuple(forced.Belt(-1.0, law, load) for law, load in zip(TWINS, (2.0, 1.5), strict=True))
+    return forced.Oscillator(0.1, belts, (forced.Harmonic(amplitude, 0.5, 1.5 * np.pi),))
+
+
+def amplitude_of(osc):
+    return osc.forcing[0].amplitude
+
+
+@pytest.mark.slow(first=True)
+def test_the_number_of_periods_near_a_fold_is_the_least():
+    """The multiplier comes near to 1, and rounding moves the state by 1e-9 a Newton step."""
+    found = jb.find_cycle(twins(2.26832), (0.65, 0.6))
+    assert int(found.status) == OK and found.periods == 2
+    assert 0.99 < float(found.multipliers[0].real) < 1
+    start = np.asarray(found.start)
+    # A Newton step's rounding.
+    back = forced_cases.stroboscopic(twins_of_engine(2.26832), start, 2).y_end
+    assert start == pytest.approx(back, abs=1e-9)
+    diagram = jb.bifurcation_diagram(
+        twins(2.26832), amplitude_of, (2.266, 2.27), rows=8, start=found
+    )
+    assert len(diagram.branches) == 1 and not diagram.open_ends
+
+
+@pytest.mark.slow
+def test_a_branch_ends_where_a_mass_begins_to_stick_by_grazing():
+    """Static friction above kinetic friction: what just touches the boundary sticks for some time,
+    and what just misses it does not."""
+    start = jb.find_cycle(twins(1.85), (0.65, 0.6))
+    diagram = jb.bifurcation_diagram(twins(1.85), amplitude_of, (1.75, 1.9), rows=24, start=start)
+    assert not diagram.open_ends
+    grazing = [point for point in diagram.points if point.kind == "GrazingSliding"]
+    assert len(grazing) == 2
+    for point in grazing:
+        first, periods = np.asarray(point.cycle.start), int(point.cycle.periods)
+        sides = [
+            forced_cases.stroboscopic(twins_of_engine(float(point.value) + off), first, periods)
+            for off in (1e-7, -1e-7)
+        ]
+        # To one side it comes back, but for the root of 1e-7; to the other it does not.
+        away = sorted(np.max(np.abs(np.subtract(run.y_end, first))) for run in sides)
+        assert away[0] < 0.01 and away[1] > 0.1
+
+
 def test_motions_and_multipliers_are_those_of_the_engine(smooth, sticking):
     # Differences of runs at 1e-13; the state is 3e-5 from grazing, so the step is small.
     for motion, frequency, h in ((smooth, 1.7079, 1e-6), (sticking, 1.68, 1e-4)):

@@ -60,6 +60,8 @@ TRIED = 3
 AT_ONSET = 1e-6
 #: Arcs whose durations differ by a smaller part may be images of one another.
 ALIKE_ARCS = 0.1
+#: Smaller jumps between static and kinetic friction, in own units, are none.
+LEAST_JUMP = 1e-6
 #: States from which motions are looked for, in own units.
 STARTS_OF_MOTIONS = (
     (0.5, 0.0),
@@ -353,6 +355,22 @@ class TimedGrazing(AbstractForcedCondition):
             if abs(rows.codes[row, k]) == 1:
                 cut = rows.cut(row, since, state, names.tangent + k)
                 yield Beginning(cut, value, system(row))
+        for row in range(len(rows.ends) - 1):
+            before, after = rows.codes[row : row + 2]
+            if rows.ends[row] == k and abs(before[k]) == 1 and after[k] == STUCK:
+                speed = self._jump_at(osc, before, after, jnp.asarray(rows.z[row + 1, :3]))
+                if speed is not None:
+                    ends = rows.ends.copy()
+                    ends[row] = names.tangent + k
+                    yield Beginning(rows._replace(ends=ends), speed**2, system(row))
+
+    def _jump_at(self, osc: Oscillator, before: Any, after: Any, y: Array) -> float | None:
+        """How fast a mass comes to the boundary at which it begins to stick; None where the law of
+        friction does not jump there, and the mass would not stick if it only touched."""
+        excess, _ = _excess(osc, jnp.asarray(after), y)
+        slopes = _guard_slopes(osc, jnp.asarray(before), y)
+        speed = abs(float(slopes[self.belt]))
+        return speed if -float(excess) > speed + LEAST_JUMP else None
 
     def _may_end(self, rows: ArcRows, row: int) -> bool:
         """Whether an arc is a stick phase to the belt, or to more belts of its velocity, from which
@@ -406,6 +424,11 @@ def _excess(osc: Oscillator, codes: Array, y: Array) -> tuple[Array, Array]:
     value, slope = at.value[-2:], at.slope[-2:]
     nearest = jnp.argmin(value)
     return -value[nearest], -slope[nearest]
+
+
+@jit
+def _guard_slopes(osc: Oscillator, codes: Array, y: Array) -> Array:
+    return guards_trend(osc, mode_of(codes), y).slope
 
 
 class TimedCrossing(_AtArrival):

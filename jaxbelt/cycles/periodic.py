@@ -60,8 +60,11 @@ MOST_STARTS = 32
 NEARLY_BACK, HARDLY_BACK = 1e-6, 1e-2
 #: Errors that the steps of integration leave in the equations; with more they are halved, so often.
 EXACT_MOTION, MESH_HALVINGS = 1e-11, 3
-#: States that differ by less are one, where the least number of periods is asked for.
-SAME_STATE = 1e-7
+#: Unknowns that still move by less are known: near a fold rounding moves them by 1e-9 and more.
+KNOWN_MOTION = 1e-7
+#: States of two motions that differ by less are one; of one motion, each of which is known to
+#: KNOWN_MOTION, where the least number of periods is asked for.
+SAME_STATE, SAME_OF_MOTION = 1e-7, 1e-6
 #: Newton steps on the state at phase 0 where the arcs that were followed are not those sought.
 OUTER_STEPS = 12
 
@@ -250,7 +253,7 @@ def _polished_motion(
     values = chain.on_both_meshes(lambda one: timed_residual(still, one, at))
     error = jnp.max(jnp.abs(values[0] - values[1]))
     residual = jnp.max(jnp.abs(values[0]))
-    fine = (residual < HOLDS) & (settled < HOLDS) & (error <= most)
+    fine = (residual < HOLDS) & (settled < KNOWN_MOTION) & (error <= most)
     status = jnp.where(fine, Status.OK.value, Status.NO_CONVERGENCE.value)
     # Where it sticks all along, no place is better than another.
     always = jnp.all(jnp.any(chain.codes == STUCK, axis=-1) | ~chain.used)
@@ -367,10 +370,8 @@ def _of_least_periods(osc: Oscillator, motion: PeriodicMotion, turns: int) -> Pe
     periods, starts = motion.periods, np.asarray(motion.starts)
     for least in (one for one in range(1, periods) if periods % one == 0):
         apart = np.max(np.abs(starts - np.roll(starts, -least, axis=0)))
-        if apart < SAME_STATE * (1 + np.max(np.abs(starts))):
-            shorter = solved_from(osc, arcs_over(osc, starts[0], turns).first(least).loop(), turns)
-            if int(shorter.status) == Status.OK:
-                return shorter
+        if apart < SAME_OF_MOTION * (1 + np.max(np.abs(starts))):
+            return solved_from(osc, arcs_over(osc, starts[0], turns).first(least).loop(), turns)
     return motion
 
 

@@ -48,13 +48,7 @@ from ..model.modes import (
 )
 from ..model.oscillator import Oscillator, at_time, fastest, has_possible_numbers
 from ..numerics.compiling import where_any
-from ..numerics.control_points import (
-    from_monomials,
-    highest_difference,
-    passage,
-    through,
-    value_at,
-)
+from ..numerics.control_points import Polynomial, highest_difference, passage, through
 from ..results import Status
 from .lanes import Lanes, Passage, choose, materialise
 from .step import (
@@ -289,23 +283,29 @@ class _GuardMeeting(eqx.Module):
     number: Array
 
 
-def _meeting(points, doubt, rounding, ends, h, room, reach, number) -> _GuardMeeting:
+def _meeting(curve: Polynomial, doubt, rounding, ends, h, room, reach, number) -> _GuardMeeting:
     """ends: the guard's (value, slope) at the start and at the end, by the time; room: see
     `step.LANDS_WITHIN`."""
     (_, slope0), (value, slope) = ends
-    met = passage(points, doubt, rounding, h < SHORTEST_TIMED_STEP * reach)
-    bend = (slope - slope0) / jnp.where(h > 0, h, 1.0)
+    met = passage(curve, doubt, rounding, h < SHORTEST_TIMED_STEP * reach)
+    bend = (slope - slope0) * _inverse(h)
     falls = slope < 0
     near = jnp.abs(value) * jnp.maximum(-slope, SLOW * jnp.abs(bend)) <= reach * slope * slope
     straight = value * value * jnp.abs(bend) * h <= room * slope * slope
     # Where it only touches, within rounding, no Taylor step leads to it.
     depth = jnp.where(bend > 0, 0.5 * slope * slope / jnp.where(bend > 0, bend, 1.0), jnp.inf)
     near = near & falls & straight & (value - depth < -rounding)
-    delta = -value / jnp.where(near, slope, 1.0)
-    delta = delta - 0.5 * bend * delta * delta / jnp.where(near, slope, 1.0)
+    per_slope = 1.0 / jnp.where(near, slope, 1.0)
+    delta = -value * per_slope
+    delta = delta - 0.5 * bend * delta * delta * per_slope
     return _GuardMeeting(
         met.once, met.cut, met.there, jnp.where(near, delta, NEVER), jnp.asarray(number)
     )
+
+
+def _inverse(h: Array) -> Array:
+    """1/h of the lanes that make a step: one division serves all guards."""
+    return 1.0 / jnp.where(h > 0, h, 1.0)
 
 
 def _quartic(start, end, change, h) -> list[Array]:
@@ -314,7 +314,7 @@ def _quartic(start, end, change, h) -> list[Array]:
     (f0, s0), (f1, s1) = start, end
     m0, m1 = h * s0, h * s1
     rise = f1 - f0
-    k4 = 30 * (change / jnp.where(h > 0, h, 1.0) - 0.5 * (f0 + f1) - (m0 - m1) / 12)
+    k4 = 30 * (change * _inverse(h) - 0.5 * (f0 + f1) - (m0 - m1) / 12)
     k4 = jnp.where(h < SHORT_TIMED_STEP, 0.0, k4)
     c2, c3 = 3 * rise - 2 * m0 - m1, m0 + m1 - 2 * rise
     return [f0, m0, c2 + k4, c3 - 2 * k4, k4]
@@ -353,8 +353,8 @@ def _meetings(
             for (value, rate), x2, a in zip(ends, (lanes.x2, new.x2), (rate0, new.rate))
         ]
         by_time = [(jnp.where(slips, g, 1.0), jnp.where(slips, slope, 0.0)) for g, slope in by_time]
-        points = from_monomials(there)
-        found.append(_meeting(points, doubt, fuzz * size, by_time, h, room, reach, i))
+        curve = Polynomial.of(there)
+        found.append(_meeting(curve, doubt, fuzz * size, by_time, h, room, reach, i))
     if window.edges is not None and window.numbers is not None:
         x1 = [lanes.x1, *(h * k / (j + 1) for j, k in enumerate(own))]
         for side, (edge, number) in enumerate(zip(window.edges, window.numbers, strict=True)):
@@ -368,8 +368,8 @@ def _meetings(
                 (jnp.where(there, way * (x - place), 1.0), jnp.where(there, way * v, 0.0))
                 for x, v in ((lanes.x1, lanes.x2), (new.x1, new.x2))
             ]
-            points = from_monomials(guard)
-            found.append(_meeting(points, doubt, fuzz * size, by_time, h, room, reach, number))
+            curve = Polynomial.of(guard)
+            found.append(_meeting(curve, doubt, fuzz * size, by_time, h, room, reach, number))
     none = jnp.zeros_like(h)
     no = none > 0
     limit = where_any(
@@ -419,13 +419,14 @@ def _limit_of_stick(
     ends = [(p, (len(points) - 1) * (q - p) / safe) for p, q in (points[:2], points[-2:])]
     ends[1] = (points[-1], ends[1][1])
     number = jnp.where(way < 0, 3 * n, 3 * n + 1).astype(lanes.hit.dtype)
-    one = _meeting(points, doubt, fuzz, ends, h, room, reach, number)
+    curve = Polynomial(points)
+    one = _meeting(curve, doubt, fuzz, ends, h, room, reach, number)
     both = (jnp.maximum(*least) <= doubt) & (h > SHORTEST_TIMED_STEP * reach)
     one = replace(one, cut=one.cut | both, there=jnp.where(both, 0.5 * one.there, one.there))
     if lands or any(isinstance(v, StepWave) for v in clock.velocities):
         return one
     # The way is straight: the state at the root is as good as that at the end.
-    _, slope, _ = value_at(points, one.there)
+    _, slope, _ = curve.at(one.there)
     sharp = doubt * safe <= STRAIGHT_GUARD * room * jnp.abs(slope)
     back = jnp.where(one.once & ~one.cut & sharp, (one.there - 1) * h, one.delta)
     return replace(one, delta=back)

@@ -37,15 +37,50 @@ class RootPassage(NamedTuple):
     there: Array
 
 
-def from_monomials(coefficients: Sequence[Array]) -> list[Array]:
-    """The control points of c0 + c1 theta + c2 theta^2 ..."""
-    n = len(coefficients) - 1
-    return [
-        functools.reduce(
-            jnp.add, [coefficients[k] * (comb(i, k) / comb(n, k)) for k in range(i + 1)]
-        )
-        for i in range(n + 1)
-    ]
+class Polynomial(NamedTuple):
+    """A polynomial on [0, 1].
+
+    points: its control points. coefficients: c0, c1, ... of c0 + c1 theta + ..., where known: they
+    take a third of the operations.
+    """
+
+    points: list[Array]
+    coefficients: list[Array] | None = None
+
+    @classmethod
+    def of(cls, coefficients: list[Array]) -> "Polynomial":
+        """c0 + c1 theta + c2 theta^2 ..."""
+        n = len(coefficients) - 1
+        points = [
+            functools.reduce(
+                jnp.add, [coefficients[k] * (comb(i, k) / comb(n, k)) for k in range(i + 1)]
+            )
+            for i in range(n + 1)
+        ]
+        return cls(points, coefficients)
+
+    def at(self, theta: Array) -> tuple[Array, Array, Array]:
+        """Its value at theta, and its first two derivatives."""
+        return self._by_de_casteljau(theta) if self.coefficients is None else self._by_horner(theta)
+
+    def _by_horner(self, theta: Array) -> tuple[Array, Array, Array]:
+        assert self.coefficients is not None
+        value, slope = self.coefficients[-1], jnp.zeros_like(theta)
+        half_bend = slope
+        for c in reversed(self.coefficients[:-1]):
+            half_bend = half_bend * theta + slope
+            slope = slope * theta + value
+            value = value * theta + c
+        return value, slope, 2 * half_bend
+
+    def _by_de_casteljau(self, theta: Array) -> tuple[Array, Array, Array]:
+        n, row = len(self.points) - 1, list(self.points)
+        while len(row) > 3:
+            row = [p + theta * (q - p) for p, q in pairwise(row)]
+        first, second = row[1] - row[0], row[2] - row[1]
+        slope = first + theta * (second - first)
+        value = row[0] + theta * first + theta * slope
+        return value, n * slope, n * (n - 1) * (second - first)
 
 
 @functools.cache
@@ -64,24 +99,14 @@ def highest_difference(points: Sequence[Array]) -> Array:
     return functools.reduce(jnp.add, terms)
 
 
-def value_at(points: Sequence[Array], theta: Array) -> tuple[Array, Array, Array]:
-    """The polynomial and its first two derivatives at theta, by de Casteljau's algorithm."""
-    n, row = len(points) - 1, list(points)
-    while len(row) > 3:
-        row = [p + theta * (q - p) for p, q in pairwise(row)]
-    first, second = row[1] - row[0], row[2] - row[1]
-    slope = first + theta * (second - first)
-    value = row[0] + theta * first + theta * slope
-    return value, n * slope, n * (n - 1) * (second - first)
-
-
-def passage(points: Sequence[Array], doubt: Array, rounding: Array, trust: Array) -> RootPassage:
-    """Whether a function comes to zero, of which a polynomial with these control points is known.
+def passage(curve: Polynomial, doubt: Array, rounding: Array, trust: Array) -> RootPassage:
+    """Whether a function comes to zero, of which a polynomial is known.
 
     doubt: how far the polynomial may be off inside; its ends are exact up to `rounding`. trust:
     where its shape is trusted whatever the doubt, because the way is as short as can be.
     """
-    points, doubt, rounding = lax.stop_gradient((list(points), doubt, rounding))
+    curve, doubt, rounding = lax.stop_gradient((curve, doubt, rounding))
+    points = curve.points
     steps = [q - p for p, q in pairwise(points)]
     rises, falls = ([way * d > rounding for d in steps] for way in (1.0, -1.0))
     seen_rise, seen_fall, peak, dip = rises[0], falls[0], None, None
@@ -100,7 +125,7 @@ def passage(points: Sequence[Array], doubt: Array, rounding: Array, trust: Array
     root = _first_passage(points, -rounding)
     dips = known & ~below & dip & ~peak & ~stays
     guess = jnp.where(dips, _first_passage([-d for d in steps], rounding), root)
-    theta, lowest = _root_step(points, guess, dips)
+    theta, lowest = _root_step(curve, guess, dips)
     passes = dips & (lowest < -jnp.maximum(doubt, rounding))
     inside = jnp.minimum(theta, 1 - theta) > 1e-3
     splits = dips & ~passes & (lowest <= doubt + rounding) & inside & ~trust
@@ -114,19 +139,21 @@ def passage(points: Sequence[Array], doubt: Array, rounding: Array, trust: Array
 def _first_passage(points: Sequence[Array], level: Array) -> Array:
     """Where the line through the control points first goes below zero; 0 where it begins there."""
     n = len(points) - 1
-    found = jnp.ones_like(points[0])
+    before, ahead, fall = jnp.zeros_like(points[0]) + n, jnp.zeros_like(points[0]), jnp.ones(())
     for i in reversed(range(n)):
         p, q = points[i], points[i + 1]
-        part = jnp.clip(p / jnp.where(p > q, p - q, 1.0), 0.0, 1.0)
-        found = jnp.where((p >= level) & (q < level), (i + part) / n, found)
+        goes_below = (p >= level) & (q < level)
+        before = jnp.where(goes_below, i, before)
+        ahead, fall = jnp.where(goes_below, p, ahead), jnp.where(goes_below, p - q, fall)
+    found = (before + jnp.clip(ahead / fall, 0.0, 1.0)) / n
     return jnp.where(points[0] < level, 0.0, found)
 
 
-def _root_step(points: Sequence[Array], theta: Array, extreme: Array) -> tuple[Array, Array]:
+def _root_step(curve: Polynomial, theta: Array, extreme: Array) -> tuple[Array, Array]:
     """The root near theta, in [0, 1], or the extremum, and the value there."""
     for _ in range(ROOT_STEPS):
-        value, slope, bend = value_at(points, theta)
+        value, slope, bend = curve.at(theta)
         over, under = jnp.where(extreme, slope, value), jnp.where(extreme, bend, slope)
         moved = theta - over / jnp.where(under == 0, 1.0, under)
         theta = jnp.clip(jnp.where(jnp.isfinite(moved), moved, theta), 0.0, 1.0)
-    return theta, value_at(points, theta)[0]
+    return theta, curve.at(theta)[0]
