@@ -304,6 +304,19 @@ def test_a_batch_of_hopf_points_and_the_slope_of_their_curve():
 
 
 @pytest.mark.slow
+def test_the_second_derivative_of_a_hopf_point():
+    """By implicit differentiation twice; of the closed form of the test above."""
+
+    def value(zeta):
+        osc = jb.Oscillator(zeta, (jb.Belt(0.2, jb.Conti(1.0, 0.6, 10.0)),))
+        return jb.refine(jb.Hopf(), osc, where=nu0).value
+
+    bend = jax.jit(jax.jacfwd(jax.grad(value)))(0.5)
+    # Rounding of the point, some 1e-16, times the third derivative over the first.
+    assert bend == pytest.approx(0.15 * 0.5**-2.5, rel=1e-12)
+
+
+@pytest.mark.slow
 def test_a_batch_of_folds_and_the_slope_of_their_curve():
     def fold(nu1):
         osc = jb.presets.class_b(0.53 - 2.4 * (nu1 - 0.35), nu1)

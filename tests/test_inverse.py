@@ -10,7 +10,7 @@ from where import nu0
 
 import jaxbelt as jb
 from jaxbelt import Status
-from jaxbelt.inverse.fit import _inverse, _undetermined
+from jaxbelt.inverse.fit import _inverted, _undetermined
 from jaxbelt.inverse.record import local_cubics
 from jaxbelt.inverse.selection import Selection, parameter_sizes
 
@@ -213,14 +213,14 @@ def test_bounded_values_and_back():
 def test_what_a_record_does_not_tell_has_an_infinite_standard_error():
     columns = np.random.default_rng(0).standard_normal((50, 4))
     columns[:, 1] = 0.0  # no influence
-    alone = _inverse(columns.T @ columns)
+    alone = _inverted(columns.T @ columns)
     assert np.isinf(alone[1, 1]) and np.all(np.isfinite(np.diag(alone)[[0, 2, 3]]))
     kept = columns[:, [0, 2, 3]]
     np.testing.assert_allclose(
         alone[np.ix_([0, 2, 3], [0, 2, 3])], np.linalg.inv(kept.T @ kept), rtol=1e-10
     )
     columns[:, 1] = columns[:, 0]  # two that trade with each other
-    trading = np.diag(_inverse(columns.T @ columns))
+    trading = np.diag(_inverted(columns.T @ columns))
     assert np.all(np.isinf(trading[:2])) and np.all(np.isfinite(trading[2:]))
 
 

@@ -123,8 +123,8 @@ def forced_branches(
 
 def _is_known_motion(point: BifurcationPoint, other: BifurcationPoint, line: ForcedLine) -> bool:
     close = abs(float(point.value) - float(other.value)) < 1e-8 * line.length
-    alike = close and type(point.condition) is type(other.condition)
-    return bool(alike and is_same_motion(point.cycle, other.cycle))
+    alike = type(point.condition) is type(other.condition)
+    return bool(close and alike and is_same_motion(point.cycle, other.cycle))
 
 
 # --- one leg: a fixed signature -------------------------------------------------------------------

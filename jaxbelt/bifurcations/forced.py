@@ -61,7 +61,7 @@ AT_ONSET = 1e-6
 #: Arcs whose durations differ by a smaller part may be images of one another.
 ALIKE_ARCS = 0.1
 #: Smaller jumps between static and kinetic friction, in own units, are none.
-JUMP_OF_FRICTION = 1e-6
+SMALLEST_JUMP = 1e-6
 #: States from which motions are looked for, in own units.
 STARTS_OF_MOTIONS = (
     (0.5, 0.0),
@@ -377,7 +377,7 @@ class TimedGrazing(AbstractForcedCondition):
         excess, _ = _excess(osc, jnp.asarray(after), y)
         slopes = _guard_slopes(osc, jnp.asarray(before), y)
         speed = abs(float(slopes[self.belt]))
-        return speed if -float(excess) > speed + JUMP_OF_FRICTION else None
+        return speed if -float(excess) > speed + SMALLEST_JUMP else None
 
     def _may_end(self, rows: ArcRows, row: int) -> bool:
         """Whether an arc is a stick phase to the belt, or to more belts of its velocity, from which

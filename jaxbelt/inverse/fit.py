@@ -425,7 +425,7 @@ def _result(
     u = jnp.asarray(point.u)
     estimates = selection.values(u)
     slopes = np.append(np.diag(jax.jacfwd(selection.values)(u)), [1.0, 1.0])
-    covariance = _inverse(point.blocks[0, :-1, :-1]) * slopes[:, None] * slopes
+    covariance = _inverted(point.blocks[0, :-1, :-1]) * slopes[:, None] * slopes
     errors = np.sqrt(np.diag(covariance))
     ys, weights = _motion_of(point, values), _weights_of(record, values)
     status = Status.OK if verdict.is_noise else Status.MISFIT
@@ -459,7 +459,7 @@ def _result(
     )
 
 
-def _inverse(matrix: np.ndarray) -> np.ndarray:
+def _inverted(matrix: np.ndarray) -> np.ndarray:
     """Inverse of a Gauss-Newton matrix; infinite variances of what is not determined."""
     scale, values, vectors = known_directions(matrix)
     inverse = (vectors / values) @ vectors.T / scale[:, None] / scale
