@@ -80,26 +80,25 @@ def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any
     is_list = isinstance(result, Sequence | np.ndarray)
     several = is_list and all(isinstance(one, Axes) for one in result)
     is_drawn = isinstance(result, Axes) or several
-    before = None
+    picture = _Picture(units)
     if ax is not None and not is_drawn:
-        _convert([ax], units, None)
-        before = _Before(ax)
+        picture.convert([ax])
+        picture.keep(ax)
     try:
         axes: Any = result if is_drawn else draw_result(result, ax, **options)
         every = [axes] if isinstance(axes, Axes) else list(axes)
         shown = [repr(axis.get_label_text()) for one in every for axis in (one.xaxis, one.yaxis)]
-        is_done = _convert(every, units, before)
+        is_done = picture.convert(every)
         quantity = options.get("quantity")
         if isinstance(result, BifurcationDiagram) and callable(quantity) and not is_done:
-            _convert_functional(axes, quantity, units, before)
+            picture.convert_functional(axes, quantity)
         if parameter is not None:
-            _scale(axes, 0, *parameter, before)
+            picture.scale(axes, 0, *parameter)
         if isinstance(result, BifurcationPoint):
             # The unit of its value is not known: a point does not record its parameter.
             axes.title.set_text(result.condition.words)
     finally:
-        if before is not None:
-            before.join()
+        picture.join()
     # Axes do not record which functional, parameter or result they show.
     expected = (
         "a picture with an axis of time, displacement, velocity, amplitude or period, or what it "
@@ -147,74 +146,96 @@ def _relabel_key(ax: Axes, units: Units) -> None:
             text.set_text(words.replace("$x_1$", "$X$").replace("$x_2$", r"$\dot X$"))
 
 
-class _Before:
-    """What axes held, in SI units, before a result was drawn into them."""
+class _Picture:
+    """Converts axes to SI units, but for what is kept: what one of them held in SI units before."""
 
-    def __init__(self, ax: Axes):
-        self.artists = {*_artists(ax)}
+    def __init__(self, units: Units):
+        self.units, self.ax = units, None
+        self.kept: set[Artist] = set()
+
+    def keep(self, ax: Axes) -> None:
+        """Keeps what axes hold, before a result is drawn into them."""
+        self.ax, self.kept = ax, {*_artists(ax)}
         self.limits = ax.get_xlim(), ax.get_ylim()
-        self.ax, self.held = ax, ax.dataLim.get_points().copy()
+        self.held = ax.dataLim.get_points().copy()
         ax.dataLim.set_points(Bbox.null().get_points())
 
     def join(self) -> None:
         """Extends limits that are not set to hold everything; the new part is in SI units now,
         too."""
+        if self.ax is None:
+            return
         lower, upper = zip(self.held, self.ax.dataLim.get_points(), strict=True)
         self.ax.dataLim.set_points(np.array([np.min(lower, axis=0), np.max(upper, axis=0)]))
         self.ax.autoscale_view()
 
+    def convert(self, every: Sequence[Axes]) -> bool:
+        """Converts axes that show a quantity with a unit; returns whether there are any."""
+        is_any = False
+        for one in every:
+            for number in (0, 1):
+                shown = _axis(one, number).get_label_text().split(", ")
+                if not all(part in LABELS for part in shown):
+                    continue
+                quantity, label = LABELS[shown[0]]
+                if len(shown) == 2:
+                    self.put_velocity_aside(one, LABELS[shown[1]][1])
+                self.scale(one, number, float(getattr(self.units, quantity)), label)
+                is_any = True
+        return is_any
 
-def _convert(every: Sequence[Axes], units: Units, before: _Before | None) -> bool:
-    """Converts axes that show a quantity with a unit to SI units; returns whether there are any."""
-    is_any = False
-    for one in every:
-        for number in (0, 1):
-            shown = _axis(one, number).get_label_text().split(", ")
-            if not all(part in LABELS for part in shown):
-                continue
-            quantity, label = LABELS[shown[0]]
-            if len(shown) == 2:
-                _put_velocity_aside(one, float(units.velocity), LABELS[shown[1]][1], before)
-            _scale(one, number, float(getattr(units, quantity)), label, before)
-            is_any = True
-    return is_any
+    def convert_functional(self, ax: Axes, functional: Callable) -> None:
+        """Converts the values of a functional of cycles where their unit is known."""
+        name, coordinate = ax.get_ylabel(), "x1"
+        if isinstance(functional, functools.partial):
+            coordinate = functional.keywords.get("coordinate", coordinate)
+            functional = functional.func
+        # A user's functional may have no hash.
+        known = [quantity for one, quantity in MEASURED_IN.items() if one is functional]
+        if not known:
+            ax.set_ylabel(f"{name} (dimensionless)")
+        elif (quantity := known[0]) != "number":
+            if quantity == "coordinate":
+                quantity = {"x1": "length", "x2": "velocity"}[coordinate]
+            symbol, size = SI_UNITS[quantity]
+            self.scale(ax, 1, float(size(self.units)), f"{name} ({in_fractions(symbol)})")
 
+    def put_velocity_aside(self, ax: Axes, label: str) -> None:
+        """Moves the velocities of axes that show displacements, too, to an axis at the right."""
+        unit, limits = float(self.units.velocity), ax.get_ylim()
+        lines = [line for line in ax.lines if "$x_2$" in str(line.get_label())]
+        aside = _right_of(ax, label)
+        for line in lines:
+            if line not in self.kept:
+                _scale_artist(line, ax, np.array([1.0, unit]))
+                line.remove()
+                line.set_transform(aside.transData)
+                aside.add_line(line)
+        ax.relim()
+        if self.ax is None:
+            aside.set_ylim(limits[0] * unit, limits[1] * unit, auto=None)
+        else:
+            aside.autoscale_view(scalex=False)
 
-def _convert_functional(
-    ax: Axes, functional: Callable, units: Units, before: _Before | None
-) -> None:
-    """Converts the values of a functional of cycles to SI units where their unit is known."""
-    name, coordinate = ax.get_ylabel(), "x1"
-    if isinstance(functional, functools.partial):
-        coordinate = functional.keywords.get("coordinate", coordinate)
-        functional = functional.func
-    # A user's functional may have no hash.
-    known = [quantity for one, quantity in MEASURED_IN.items() if one is functional]
-    if not known:
-        ax.set_ylabel(f"{name} (dimensionless)")
-    elif (quantity := known[0]) != "number":
-        if quantity == "coordinate":
-            quantity = {"x1": "length", "x2": "velocity"}[coordinate]
-        symbol, size = SI_UNITS[quantity]
-        _scale(ax, 1, float(size(units)), f"{name} ({in_fractions(symbol)})", before)
-
-
-def _put_velocity_aside(ax: Axes, unit: float, label: str, before: _Before | None) -> None:
-    """Moves the velocities of axes that show displacements, too, to an axis at the right."""
-    limits = ax.get_ylim()
-    lines = [line for line in ax.lines if "$x_2$" in str(line.get_label())]
-    aside = _right_of(ax, label)
-    for line in lines:
-        if before is None or line not in before.artists:
-            _scale_artist(line, ax, np.array([1.0, unit]))
-            line.remove()
-            line.set_transform(aside.transData)
-            aside.add_line(line)
-    ax.relim()
-    if before is None:
-        aside.set_ylim(limits[0] * unit, limits[1] * unit, auto=None)
-    else:
-        aside.autoscale_view(scalex=False)
+    def scale(self, ax: Axes, number: int, unit: float, label: str) -> None:
+        """Scales what is drawn along the x (0) or y axis (1), and its limits."""
+        sizes = np.where(np.arange(2) == number, unit, 1.0)
+        limits = (ax.get_xlim(), ax.get_ylim())[number]
+        shared = (ax.get_shared_x_axes, ax.get_shared_y_axes)[number]().get_siblings(ax)
+        for one in shared if self.ax is None else [ax]:
+            one.dataLim.set_points(one.dataLim.get_points() * sizes)
+            for artist in _artists(one):
+                if artist not in self.kept:
+                    _scale_artist(artist, one, sizes)
+            if _axis(one, number).get_label_text():
+                _axis(one, number).set_label_text(label)
+        if self.ax is None or limits != self.limits[number]:
+            first, last = limits
+            (ax.set_xlim, ax.set_ylim)[number](first * unit, last * unit, auto=None)
+        if number == 0:
+            # Numbers such as 0.0015 need more room than Matplotlib leaves between them.
+            count = max(2, int(0.65 * ax.xaxis.get_tick_space()))
+            ax.xaxis.set_major_locator(MaxNLocator(count, steps=[1, 2, 5, 10]))
 
 
 def _right_of(ax: Axes, label: str) -> Axes:
@@ -231,28 +252,6 @@ def _right_of(ax: Axes, label: str) -> Axes:
 
 def _axis(ax: Axes, number: int) -> Axis:
     return (ax.xaxis, ax.yaxis)[number]
-
-
-def _scale(ax: Axes, number: int, unit: float, label: str, before: _Before | None) -> None:
-    """Scales what is drawn along the x (0) or y axis (1), and its limits, but not what was there
-    before."""
-    sizes = np.where(np.arange(2) == number, unit, 1.0)
-    limits = (ax.get_xlim(), ax.get_ylim())[number]
-    shared = (ax.get_shared_x_axes, ax.get_shared_y_axes)[number]().get_siblings(ax)
-    for one in shared if before is None else [ax]:
-        one.dataLim.set_points(one.dataLim.get_points() * sizes)
-        for artist in _artists(one):
-            if before is None or artist not in before.artists:
-                _scale_artist(artist, one, sizes)
-        if _axis(one, number).get_label_text():
-            _axis(one, number).set_label_text(label)
-    if before is None or limits != before.limits[number]:
-        first, last = limits
-        (ax.set_xlim, ax.set_ylim)[number](first * unit, last * unit, auto=None)
-    if number == 0:
-        # Numbers such as 0.0015 need more room than Matplotlib leaves between them.
-        count = max(2, int(0.65 * ax.xaxis.get_tick_space()))
-        ax.xaxis.set_major_locator(MaxNLocator(count, steps=[1, 2, 5, 10]))
 
 
 def _artists(ax: Axes) -> list[Artist]:
