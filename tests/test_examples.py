@@ -42,7 +42,8 @@ find_cycle fit minimal_fatal_shock orbit_diagram plot_basins portrait region_map
 """.split()
 #: Long, and the only examples of what they show.
 FIRST = """
-Arcs Basins-class HopfAtInfinity Tabulated explore forcing in_si laws lyapunov simulate verify
+Arcs Basins-class HopfAtInfinity Tabulated explore forcing in_si laws lyapunov periodic
+plot_in_si simulate verify
 """.split()
 
 
