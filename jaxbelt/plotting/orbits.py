@@ -61,7 +61,7 @@ def plot_orbits(
 def _lines(ax: Axes, diagram: OrbitDiagram) -> list[_Dots]:
     """Lines without points; where the parameter rises and falls one of each kind for each sense."""
     everywhere = tuple(range(diagram.kind.shape[1]))
-    both = diagram.sampling.senses == ("up", "down")
+    both = diagram.sampling is not None and diagram.sampling.senses == ("up", "down")
     lines = []
     for kind, look in DOTS.items():
         if both and kind in FALLING:
