@@ -89,8 +89,8 @@ def amplitude_of(osc):
 
 
 @pytest.mark.slow(first=True)
-def test_the_number_of_periods_near_a_fold_is_the_least():
-    """The multiplier comes near to 1, and rounding moves the state by 1e-9 a Newton step."""
+def test_the_number_of_periods_beside_a_period_doubling_is_the_least():
+    """A multiplier is near to 1, and rounding moves the state by 1e-9 a Newton step."""
     found = jb.find_cycle(twins(2.26832), (0.65, 0.6))
     assert int(found.status) == OK and found.periods == 2
     assert 0.99 < float(found.multipliers[0].real) < 1
@@ -98,10 +98,18 @@ def test_the_number_of_periods_near_a_fold_is_the_least():
     # A Newton step's rounding.
     back = forced_cases.stroboscopic(twins_of_engine(2.26832), start, 2).y_end
     assert start == pytest.approx(back, abs=1e-9)
-    diagram = jb.bifurcation_diagram(
-        twins(2.26832), amplitude_of, (2.266, 2.27), rows=8, start=found
-    )
-    assert len(diagram.branches) == 1 and not diagram.open_ends
+    span = 2.266, 2.27
+    diagram = jb.bifurcation_diagram(twins(2.26832), amplitude_of, span, rows=8, start=found)
+    assert not diagram.open_ends
+    (point,) = diagram.points
+    assert point.kind == "PeriodDoubling" and point.cycle.periods == 1
+    # The motion of two periods ends there, and that of one period, which it has left, goes on.
+    own, other = diagram.branches
+    assert {motion.periods for motion in own.cycles} == {2}
+    assert {motion.periods for motion in other.cycles} == {1}
+    assert own.values.max() < float(point.value)
+    assert other.values[[0, -1]] == pytest.approx(span, abs=1e-12)
+    assert np.array_equal(other.stable, other.values > float(point.value))
 
 
 @pytest.mark.slow

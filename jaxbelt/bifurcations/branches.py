@@ -5,7 +5,7 @@ pseudo-arclength follows, round folds, too. Between two points of it functions o
 change their signs; then that point is solved for. Where the motion leaves its signature, the
 conditions on sliding are solved from the last motion before, and the nearest of their points is
 where the branch goes on with another signature: to the other side of the point, or back on the same
-one. At a period doubling the branch that leaves is followed, too.
+one. At a period doubling the other branch that meets this one there is followed, too.
 """
 
 from collections.abc import Iterator
@@ -99,7 +99,7 @@ class ForcedLine(NamedTuple):
 def forced_branches(
     variation: Variation, span: tuple[float, float], start: PeriodicMotion, value: float
 ) -> tuple[list[MotionBranch], list[BifurcationPoint]]:
-    """The branch of a motion at a value, within a span, to both sides, and those that leave it at
+    """The branch of a motion at a value, within a span, to both sides, and those that meet it in
     period doublings; and the points on them. All in own units."""
     line = ForcedLine(variation, *span, turns_of(start.oscillator))
     branches, found, waiting = [], [], [(MotionRow(value, start), True)]
@@ -116,8 +116,8 @@ def forced_branches(
                 continue
             found.append(point)
             if is_first and isinstance(point.condition, PeriodDoubling):
-                leaving = _leaving(line, point)
-                waiting += [(leaving, False)] if leaving is not None else []
+                other = _other_branch(line, point, row.motion)
+                waiting += [(other, False)] if other is not None else []
     return branches, sorted(found, key=lambda point: float(point.value))
 
 
@@ -432,6 +432,16 @@ def _beyond_point(
                 if not same and MotionLeg.begun(line, row)[1].found:
                     return row, side * direction
     return None
+
+
+def _other_branch(
+    line: ForcedLine, point: BifurcationPoint, motion: PeriodicMotion
+) -> MotionRow | None:
+    """A motion of the other branch that meets the branch of a motion in a period doubling: of twice
+    the periods, or the one that goes on where the motion has left it there."""
+    if point.cycle.periods < motion.periods:
+        return MotionRow(float(point.value), point.cycle)
+    return _leaving(line, point)
 
 
 def _leaving(line: ForcedLine, point: BifurcationPoint) -> MotionRow | None:

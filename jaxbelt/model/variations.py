@@ -398,7 +398,8 @@ class Variation:
         """Whether any of the oscillators may have a contact edge; values: possible ones, [k]."""
         if self.line is not None:
             slopes = jax.tree.unflatten(jax.tree.structure(self.line.oscillator), self.line.slopes)
-            vary = [not isinstance(row, NoEdge) and np.any(row) for row in interval_ends(slopes)]
+            ends = [row for row in interval_ends(slopes) if not isinstance(row, NoEdge)]
+            vary = [not is_concrete(row) or bool(np.any(row)) for row in ends]
             return any(vary) or has_edges(self.line.oscillator)
         if not is_concrete(values):
             return True
