@@ -502,7 +502,7 @@ class UnitsOfVariation(NamedTuple):
 
 def _varies_omega(line: Family) -> bool:
     slopes = jax.tree.unflatten(jax.tree.structure(line.oscillator), line.slopes)
-    return bool(np.any(np.asarray(slopes.omega)))
+    return not is_concrete(slopes.omega) or bool(np.any(slopes.omega))
 
 
 def as_span(span: Any, where: Any) -> tuple[float, float]:
