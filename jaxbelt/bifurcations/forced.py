@@ -273,7 +273,7 @@ def motions_to_begin_from(osc: OwnOscillator, start: Any, turns: int) -> Sequenc
 
 
 def motion_between_halves(
-    osc: OwnOscillator, motion: PeriodicMotion, turns: int
+    osc: Oscillator, motion: PeriodicMotion, turns: int
 ) -> PeriodicMotion | None:
     """The motion of half as many periods from which one may have left in a period doubling."""
     half, odd = divmod(motion.periods, 2)
