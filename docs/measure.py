@@ -5,6 +5,7 @@ takes some minutes, most of them compilation, for which no cache is used. With n
 as arguments only these are measured, and nothing is written.
 """
 
+import functools
 import os
 import platform
 import re
@@ -74,6 +75,21 @@ def _fit():
 
 def _amplitude(velocity):
     return jb.amplitude(jb.find_cycle(FAMILY(velocity, 0.35), (3.0, 0.0)))
+
+
+FORCED = jb.presets.di_bernardo
+FROM = (0.5, 0.0)
+
+
+def frequency(osc):
+    """The frequency of the force."""
+    return osc.forcing[0].frequency
+
+
+@functools.cache
+def _sticking():
+    """A motion of two periods that sticks, with forcing."""
+    return jb.find_cycle(FORCED(1.68), FROM)
 
 
 BATCH = jnp.linspace(0.3, 0.6, 1024)
@@ -219,6 +235,41 @@ QUESTIONS = [
         ),
         1,
         "design",
+    ),
+    Question(
+        "periodic",
+        "with forcing, the periodic motion near a guess",
+        lambda: jb.periodic(FORCED(1.68), _sticking().start, periods=2),
+        1,
+        "motion",
+    ),
+    Question(
+        "bifurcation_diagram, start=",
+        "its branch, and the points on it",
+        lambda: jb.bifurcation_diagram(FORCED(1.68), frequency, (1.675, 1.69), start=_sticking()),
+        1,
+        "branch",
+    ),
+    Question(
+        "lyapunov",
+        "exponents of chaos over 1,000 periods",
+        lambda: jb.lyapunov(FORCED(1.7), FROM),
+        1,
+        "run",
+    ),
+    Question(
+        "circle_map",
+        "where 400 slip onsets lead, and the periodic motions among them",
+        lambda: jb.circle_map(FORCED(1.68)),
+        1,
+        "map",
+    ),
+    Question(
+        'orbit_diagram, sense="both"',
+        "points once in a period at 400 frequencies, rising and falling",
+        lambda: jb.orbit_diagram(FORCED, span=(1.66, 1.73), y0=FROM, sense="both"),
+        800,
+        "value",
     ),
 ]
 
