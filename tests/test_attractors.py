@@ -35,6 +35,7 @@ def test_attractors_and_fractions_are_those_of_basins(dataset):
     assert absent.fraction == 0 and np.isnan(absent.period) and words.kind[0, 0, 1] == "undecided"
 
 
+@pytest.mark.slow(first=True)
 def test_they_can_be_drawn_and_written(dataset, tmp_path):
     found = jb.attractors(dataset)
     found.kind.isel(nu1=0).plot()

@@ -50,6 +50,7 @@ def test_the_papers_table(make, condition, exact, offset):
     assert nu0(point.oscillator) == point.value
 
 
+@pytest.mark.slow(first=True)
 def test_cycle_at_a_fold_has_a_stick_phase_of_no_duration():
     point = jb.refine(jb.NonsmoothFold(1), class_b(0.53), where=nu0)
     assert point.cycle.status == Status.OK

@@ -68,6 +68,7 @@ def test_stick_slip_is_a_circle_and_a_straight_line(v):
     assert max(map(abs, found.x1)) == pytest.approx(mud + sqrt(d * d + v * v), **EXACT)
 
 
+@pytest.mark.slow(first=True)
 def test_a_crossing_is_a_change_of_circles():
     # Around +0.5 while x2 < 0.2, around -0.5 above; at x2 = 0.2 nothing can hold the mass.
     osc = Oscillator(0.0, (coulomb(0.2, 0.5, 0.5),))

@@ -256,6 +256,7 @@ def cells():
     return jb.region_map(jb.presets.class_b, {"nu0": NU0S, "nu1": NU1S}, lines=0)
 
 
+@pytest.mark.slow(first=True)
 def test_cells_are_named_as_the_oracle_finds(cells):
     rng = np.random.default_rng(7)
     for i, j in zip(rng.integers(0, 12, 14), rng.integers(0, 11, 14), strict=True):

@@ -110,7 +110,10 @@ def test_a_segment_between_the_edges():
     ("make", "span"),
     [
         # The pseudo-focus stays on the edge of belt 0, to the left, and stable.
-        (lambda upper: beside(upper, 0.65, (0.35, -0.6)), (0.64, 0.66)),
+        pytest.param(
+            *(lambda upper: beside(upper, 0.65, (0.35, -0.6)), (0.64, 0.66)),
+            marks=pytest.mark.slow(first=True),
+        ),
         # The edge of a belt without load is that of nothing.
         (lambda upper: beside(upper, 0.4, loads=(1.0, 0.0)), (0.399, 0.401)),
     ],

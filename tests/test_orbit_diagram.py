@@ -255,6 +255,7 @@ def test_an_impossible_quantity():
         MadeUp().diagram((0.0, 1.0)).plot(quantity="x3")
 
 
+@pytest.mark.slow(first=True)
 def test_a_parameter_that_rises_and_falls_keeps_its_attractor():
     """From -0.55 to the Hopf point at -0.26365 an equilibrium and a cycle coexist."""
     osc = jb.presets.class_b(0.3, NU1)

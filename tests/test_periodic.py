@@ -147,6 +147,7 @@ def test_a_branch_of_twice_the_periods_ends_where_it_left():
     assert np.min(away) < 0.001 * 0.015 and np.max(away) > 0.005
 
 
+@pytest.mark.slow(first=True)
 def test_motions_and_multipliers_are_those_of_the_engine(smooth, sticking):
     # Differences of runs at 1e-13; the state is 3e-5 from grazing, so the step is small.
     for motion, frequency, h in ((smooth, 1.7079, 1e-6), (sticking, 1.68, 1e-4)):
