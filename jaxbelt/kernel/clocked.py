@@ -245,17 +245,6 @@ def _least_share(osc: Oscillator, lanes: Lanes, clock: StepClock, rise, a_end, r
     return functools.reduce(jnp.minimum, shares)
 
 
-def timed_flown(
-    osc, window: TimedWindow, ones: Array, lanes: Lanes, h: Array, x1: Array, x2: Array
-):
-    """The states (x1, x2) that a step of size h leads to from those of the arguments."""
-    a = needed_or_rate(osc, lanes.mode, lanes.t, x1, x2)
-    lanes = replace(lanes, x1=x1, x2=x2, a=a)
-    clock = StepClock.of(osc, ones, lanes.t, h)
-    new = _timed_attempt(osc, clock, window, lanes, jnp.ones(()), jnp.ones(()), None)
-    return new.x1, new.x2
-
-
 def _moves(now: Oscillator) -> bool:
     return any(hasattr(belt, "rate") for belt in now.belts)
 
