@@ -18,6 +18,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from .polynomials import Jet, jet
+
 #: Part of its range that a polynomial may be wrong by, and still be trusted to rise and fall as it
 #: does.
 TRUSTED = 0.25
@@ -59,21 +61,13 @@ class Polynomial(NamedTuple):
         ]
         return cls(points, coefficients)
 
-    def at(self, theta: Array) -> tuple[Array, Array, Array]:
+    def at(self, theta: Array) -> Jet:
         """Its value at theta, and its first two derivatives."""
-        return self._by_de_casteljau(theta) if self.coefficients is None else self._by_horner(theta)
+        if self.coefficients is not None:
+            return jet(self.coefficients, theta)
+        return self._by_de_casteljau(theta)
 
-    def _by_horner(self, theta: Array) -> tuple[Array, Array, Array]:
-        assert self.coefficients is not None
-        value, slope = self.coefficients[-1], jnp.zeros_like(theta)
-        half_bend = slope
-        for c in reversed(self.coefficients[:-1]):
-            half_bend = half_bend * theta + slope
-            slope = slope * theta + value
-            value = value * theta + c
-        return value, slope, 2 * half_bend
-
-    def _by_de_casteljau(self, theta: Array) -> tuple[Array, Array, Array]:
+    def _by_de_casteljau(self, theta: Array) -> Jet:
         n, row = len(self.points) - 1, list(self.points)
         while len(row) > 3:
             row = [p + theta * (q - p) for p, q in pairwise(row)]

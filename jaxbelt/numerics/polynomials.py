@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import jax.numpy as jnp
 from jaxtyping import Array
 
 #: A value, and its first two derivatives.
@@ -14,6 +15,17 @@ def polynomial(coefficients: Sequence[Array], x: Array) -> Array:
     for one in reversed(coefficients[:-1]):
         total = total * x + one
     return total
+
+
+def jet(coefficients: Sequence[Array], x: Array) -> Jet:
+    """The value and the first two derivatives at x, by Horner's rule in one pass."""
+    value, slope = coefficients[-1], jnp.zeros_like(x)
+    half_bend = slope
+    for one in reversed(coefficients[:-1]):
+        half_bend = half_bend * x + slope
+        slope = slope * x + value
+        value = value * x + one
+    return value, slope, 2 * half_bend
 
 
 def derivative(coefficients: Sequence[Array]) -> list[Array]:
