@@ -16,6 +16,9 @@ from .oscillator import Oscillator
 
 #: Speed at the edge above which no orbit counts as captured by a stable pseudo-focus there.
 FOCUS_RADIUS = 1e-2
+#: That speed over the larger one of the edge and the belts' velocities: a heavy belt makes the own
+#: unit larger than the motion.
+FOCUS_SHARE = 4 * FOCUS_RADIUS
 #: Speed at the edge below which loops around it, as wide as its square, are rounding of x1.
 FOCUS_ROUNDING = 1e-7
 
@@ -93,16 +96,18 @@ def is_captured(osc: Oscillator, left: Mode, right: Mode, edge: Array, x2: Array
     on_left, on_right = (field_at_rest(osc, mode, edge) for mode in (left, right))
     focus = _edge_focus(on_left, on_right)
     size = jnp.abs(x2)
-    nearest = jnp.inf
+    nearest, largest = jnp.inf, jnp.abs(edge)
     for belt, is_left, is_right in zip(osc.belts, left.touching, right.touching, strict=True):
-        rubs = (is_left | is_right) & (belt.load != 0)
-        nearest = jnp.minimum(nearest, jnp.where(rubs, jnp.abs(belt.velocity), jnp.inf))
+        rubs, speed = (is_left | is_right) & (belt.load != 0), jnp.abs(belt.velocity) / osc.omega
+        nearest = jnp.minimum(nearest, jnp.where(rubs, speed, jnp.inf))
+        largest = jnp.maximum(largest, jnp.where(rubs, speed, 0.0))
     captured = (
         focus.exists
         & (focus.rate < 0)
         & (10 * size**2 * focus.bend < -focus.rate)
         & (size < FOCUS_RADIUS)
-        & (2 * osc.omega * size < nearest)
+        & (size < FOCUS_SHARE * largest)
+        & (2 * size < nearest)
         & _is_alone(osc, edge, size**2 / on_left[0], size**2 / -on_right[0])
     )
     (a_left, trace_left, *_), (a_right, trace_right, *_) = on_left, on_right
