@@ -20,7 +20,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     model/          variations modes pseudofocus transitions instants rest events equilibria
     model/          far_out
     presets         the published systems
-    kernel/         lanes marks step events rounds waves clocked
+    kernel/         lanes marks step events rounds waves holds clocked
     motion/         integrators arcs flights sensitivities sampling loops batches timed runs
     motion/         smoothing simulate
     cycles/         chains settling shooting motions closure clocked followed periodic exponents

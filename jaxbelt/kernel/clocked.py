@@ -50,6 +50,7 @@ from ..model.oscillator import Oscillator, at_time, fastest, has_possible_number
 from ..numerics.compiling import where_any
 from ..numerics.control_points import Polynomial, highest_difference, passage, through
 from ..results import Status
+from .holds import NEEDED_ROUNDING, Hold, hold_from, is_steady
 from .lanes import Lanes, Passage, choose, materialise
 from .step import (
     LANDING,
@@ -70,8 +71,8 @@ from .waves import StepClock, StepWave
 #: Longest step of a mass that sticks, times the highest frequency: the polynomial of what is needed
 #: is then good to 1e-9, and steps that end at its root are made again.
 LONGEST_STUCK = 1.2
-#: Rounding of guards, over their size: of boundaries and edges, and of what is needed.
-GUARD_DOUBT, NEEDED_ROUNDING = 1e-15, 1e-13
+#: Rounding of boundaries and edges, over their size.
+GUARD_DOUBT = 1e-15
 #: Steps shorter than this have their polynomials from values and slopes alone: what the integral
 #: adds is rounding.
 SHORT_TIMED_STEP = 1e-3
@@ -113,7 +114,7 @@ def timed_lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, t0: Any) ->
     status = jnp.where(forever, Status.STUCK_FOREVER.value, Status.OK.value)
     status = jnp.where(rests, Status.PSEUDO_FOCUS.value, status)
     status = jnp.where(finite, status, Status.NOT_FINITE.value)
-    count = jnp.zeros_like(run)
+    count, h = jnp.zeros_like(run), zero + first_step(rtol)
     return Lanes(
         run=run,
         first_pass=jnp.full_like(run, passes),
@@ -121,7 +122,8 @@ def timed_lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, t0: Any) ->
         x1=x1,
         x2=x2,
         a=needed_or_rate(osc, mode, t, x1, x2) + zero,
-        h=zero + first_step(rtol),
+        # A steady stick phase is asked for its end before the first step.
+        h=jnp.where(mode.any_stuck, -h, h) if is_steady(osc) else h,
         pace=zero + STEP_SAFETY / first_step(rtol),
         mode=mode,
         events=count,
@@ -131,6 +133,7 @@ def timed_lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, t0: Any) ->
         upper=x2,
         memory=None,
         hit=count - 1,
+        until=zero + jnp.inf,
     )
 
 
@@ -272,11 +275,14 @@ class _GuardMeeting(eqx.Module):
     number: Array
 
 
-def _meeting(curve: Polynomial, doubt, rounding, ends, h, room, reach, number) -> _GuardMeeting:
+def _meeting(
+    curve: Polynomial, doubt, rounding, ends, clock: StepClock, room, reach, number
+) -> _GuardMeeting:
     """ends: the guard's (value, slope) at the start and at the end, by the time; room: see
     `step.LANDS_WITHIN`."""
     (_, slope0), (value, slope) = ends
-    met = passage(curve, doubt, rounding, h < SHORTEST_TIMED_STEP * reach)
+    h, keep = clock.h, functools.partial(materialise, ones=clock.ones)
+    met = passage(curve, doubt, rounding, h < SHORTEST_TIMED_STEP * reach, keep)
     bend = (slope - slope0) * _per_step(h)
     falls = slope < 0
     near = jnp.abs(value) * jnp.maximum(-slope, SLOW * jnp.abs(bend)) <= reach * slope * slope
@@ -322,8 +328,11 @@ def _meetings(
     own = _quartic((lanes.x2, rate0), (new.x2, new.rate), new.x1 - lanes.x1, h)
     own = [materialise(k, ones) for k in own]
     found, fuzz = [], GUARD_DOUBT * blur(lanes.t)
+    steady = is_steady(osc)
     for i, code in enumerate(mode.codes):
         slips = jnp.abs(code) == 1
+        if steady:
+            slips = slips & ~stuck
         v = clock.velocities[i]
         ends = (v.at(0.0), v.rate(0.0)), (v.at(1.0), v.rate(1.0))
         wave = [ends[0][0]]
@@ -343,11 +352,13 @@ def _meetings(
         ]
         by_time = [(jnp.where(slips, g, 1.0), jnp.where(slips, slope, 0.0)) for g, slope in by_time]
         curve = Polynomial.of(there)
-        found.append(_meeting(curve, doubt, fuzz * size, by_time, h, room, reach, i))
+        found.append(_meeting(curve, doubt, fuzz * size, by_time, clock, room, reach, i))
     if window.edges is not None and window.numbers is not None:
         x1 = [lanes.x1, *(h * k / (j + 1) for j, k in enumerate(own))]
         for side, (edge, number) in enumerate(zip(window.edges, window.numbers, strict=True)):
             way, there = (1.0, -1.0)[side], jnp.isfinite(edge)
+            if steady:
+                there = there & ~stuck
             place = jnp.where(there, edge, 0.0)
             guard = [jnp.where(there, way * k, 0.0) for k in (x1[0] - place, *x1[1:])]
             guard[0] = jnp.where(there, guard[0], 1.0)
@@ -358,7 +369,9 @@ def _meetings(
                 for x, v in ((lanes.x1, lanes.x2), (new.x1, new.x2))
             ]
             curve = Polynomial.of(guard)
-            found.append(_meeting(curve, doubt, fuzz * size, by_time, h, room, reach, number))
+            found.append(_meeting(curve, doubt, fuzz * size, by_time, clock, room, reach, number))
+    if steady:  # the end of a stick phase is known beforehand
+        return found
     none = jnp.zeros_like(h)
     no = none > 0
     limit = where_any(
@@ -409,7 +422,7 @@ def _limit_of_stick(
     ends[1] = (points[-1], ends[1][1])
     number = jnp.where(way < 0, 3 * n, 3 * n + 1).astype(lanes.hit.dtype)
     curve = Polynomial(points)
-    one = _meeting(curve, doubt, fuzz, ends, h, room, reach, number)
+    one = _meeting(curve, doubt, fuzz, ends, clock, room, reach, number)
     both = (jnp.maximum(*least) <= doubt) & (h > SHORTEST_TIMED_STEP * reach)
     one = replace(one, cut=one.cut | both, there=jnp.where(both, 0.5 * one.there, one.there))
     if lands or any(isinstance(v, StepWave) for v in clock.velocities):
@@ -438,6 +451,9 @@ def take_timed_step(
     remaining = t1 - lanes.t
     going = window.active & (lanes.h > 0) & (remaining > 0)
     h = jnp.where(going, jnp.minimum(jnp.minimum(lanes.h, window.longest), remaining), 0.0)
+    to_end = jnp.where(window.stuck, lanes.until - lanes.t, jnp.inf)
+    ends_hold = going & (h >= to_end)
+    h = jnp.minimum(h, to_end)
     clock = StepClock.of(osc, ones, lanes.t, h)
     new = _timed_attempt(osc, clock, window, lanes, rtol, atol, rates)
     # Integrals are known at the ends of steps, and near to them.
@@ -460,14 +476,17 @@ def take_timed_step(
     last = h >= remaining
     accepted = going & (new.error <= 1)
     lands = accepted & ~blocked & reached & ~(last & (delta > 0))
+    delta, ends_hold = jnp.where(lands, delta, 0.0), ends_hold & accepted
+    lands, number = lands | ends_hold, jnp.where(ends_hold, lanes.hit, number)
     outcome = jnp.where(accepted, jnp.where(blocked, -1.0, 1.0), 0.0)
     outcome = materialise(jnp.where(lands, 2.0, outcome), ones)
     shortened, kept, lands = outcome < 0, outcome > 0, outcome > 1
     theta = materialise(theta, ones)
-    delta = lax.stop_gradient(materialise(jnp.where(lands, delta, 0.0), ones))
+    delta = lax.stop_gradient(materialise(delta, ones))
     x1 = new.x1 + delta * (new.x2 + 0.5 * delta * new.rate)
     x2 = new.x2 + delta * new.rate
     t = jnp.where(last & ~lands, t1, lanes.t + h + delta)
+    t = jnp.where(ends_hold, lanes.until, t)
     pace, proposed = next_size(lanes, new, going, accepted)
     proposed = jnp.where(window.stuck & accepted, 4 * h, proposed)
     stands = shortened & (theta * h < NO_STEP)
@@ -497,9 +516,20 @@ def _timed_integrated(rates, osc, lanes: Lanes, new: _TimedAttempt, delta, x1, x
 
 
 def pass_timed_events(
-    osc: Oscillator, lanes: Lanes, t1: Array, rtol: Array, *, captures: bool, derivatives: bool
+    osc: Oscillator,
+    lanes: Lanes,
+    t1: Array,
+    rtol: Array,
+    *,
+    captures: bool,
+    derivatives: bool,
+    jumps: bool,
 ) -> tuple[Lanes, Passage]:
-    """Lanes that stand on a guard go on, see `events.pass_events`."""
+    """Lanes that stand on a guard go on, see `events.pass_events`.
+
+    jumps: whether a stick phase whose end is known is passed at once; else it is stepped through,
+    for observers that look at what is between the events.
+    """
     landed = (lanes.h < 0) & ~lanes.done
     fired = landed & (lanes.hit >= 0)
 
@@ -522,6 +552,27 @@ def pass_timed_events(
     happened = fired & changed
     status = jnp.where(captured, Status.PSEUDO_FOCUS.value, lanes.status)
     status = jnp.where(forever & fired, Status.STUCK_FOREVER.value, status)
+    # A stick phase is known beforehand.
+    h = jnp.where(fired, jnp.where(mode.any_stuck, LONGEST_STEP, first_step(rtol)), abs(lanes.h))
+    after = replace(
+        lanes,
+        x1=x1,
+        x2=x2,
+        a=a,
+        h=h,
+        pace=jnp.where(fired, STEP_SAFETY / first_step(rtol), lanes.pace),
+        mode=mode,
+        events=lanes.events + jnp.where(happened, 1, 0),
+        status=status,
+        done=lanes.done | captured,
+        hit=jnp.where(landed, -1, lanes.hit).astype(lanes.hit.dtype),
+    )
+    stuck = released = no
+    if is_steady(osc):
+        after = _planned(osc, after, landed, t1)
+        if jumps:
+            stuck = landed & mode.any_stuck & ~after.done
+            after, released = _jumped(osc, after, stuck, t1, rtol)
     passage = Passage(
         landed=landed,
         fired=happened,
@@ -533,23 +584,54 @@ def pass_timed_events(
         x2=x2,
         captured=captured,
         rests=no,
-        stuck=no,
-        duration=jnp.zeros_like(x1),
-        released=no,
+        stuck=stuck,
+        duration=after.t - lanes.t,
+        released=released,
         forever=forever & fired,
     )
+    return replace(after, done=after.done | (after.t >= t1)), passage
+
+
+def _planned(osc: Oscillator, lanes: Lanes, landed: Array, t1: Array) -> Lanes:
+    """The lanes with the ends of the stick phases that begin, or go on where the search for their
+    ends stopped."""
+    begins = landed & lanes.mode.any_stuck & ~lanes.done
+    asked = begins & (lanes.status != Status.STUCK_FOREVER.value)
+    remaining = t1 - lanes.t
+    state = lanes.mode, asked, lanes.x1, lanes.x2, lanes.t, remaining
+    never = Hold(remaining, jnp.full_like(lanes.hit, -1))
+    hold = where_any(asked, lambda: hold_from(osc, *state), never)
+    duration, number = select(asked, hold, never)
+    goes_on = (number < 0) & (duration >= remaining)
+    return replace(
+        lanes,
+        until=jnp.where(begins, jnp.where(goes_on, jnp.inf, lanes.t + duration), lanes.until),
+        hit=jnp.where(begins, number, lanes.hit).astype(lanes.hit.dtype),
+        # No step leads to where a lane is.
+        h=jnp.where(begins & ~goes_on & (duration <= 0), -LONGEST_STEP, lanes.h),
+    )
+
+
+def _jumped(osc: Oscillator, lanes: Lanes, stuck: Array, t1, rtol) -> tuple[Lanes, Array]:
+    """The lanes that are stuck at the ends of their phases, and those that begin to slip there;
+    those that come to an edge, or whose end is not known yet, have landed."""
+    n = len(osc.belts)
+    released = stuck & (lanes.until <= t1) & (lanes.hit >= 3 * n)
+    t = jnp.where(stuck, jnp.minimum(lanes.until, t1), lanes.t)
+    x1 = jnp.where(stuck, lanes.x1 + lanes.x2 * (t - lanes.t), lanes.x1)
+    mode = select(
+        released, lanes.mode.slipping(jnp.where(lanes.hit > 3 * n, 1.0, -1.0)), lanes.mode
+    )
+    a = where_any(stuck, lambda: needed_or_rate(osc, mode, t, x1, lanes.x2), lanes.a)
+    h = jnp.where(stuck, jnp.where(released, first_step(rtol), -LONGEST_STEP), lanes.h)
     lanes = replace(
         lanes,
+        t=t,
         x1=x1,
-        x2=x2,
-        a=a,
-        # A stick phase is known beforehand.
-        h=jnp.where(fired, jnp.where(mode.any_stuck, LONGEST_STEP, first_step(rtol)), abs(lanes.h)),
-        pace=jnp.where(fired, STEP_SAFETY / first_step(rtol), lanes.pace),
+        a=jnp.where(stuck, jnp.where(released, without_rounding(a, x1), a), lanes.a),
+        h=h,
         mode=mode,
-        events=lanes.events + jnp.where(happened, 1, 0),
-        status=status,
-        done=lanes.done | captured | (lanes.t >= t1),
-        hit=jnp.where(landed, -1, lanes.hit).astype(lanes.hit.dtype),
+        events=lanes.events + jnp.where(released, 1, 0),
+        hit=jnp.where(released, -1, lanes.hit).astype(lanes.hit.dtype),
     )
-    return lanes, passage
+    return lanes, released

@@ -31,7 +31,8 @@ class Lanes(eqx.Module):
     that the last error would have allowed; mode; events: how many there were; status; done. lower,
     upper: extrema of x2 since the observer reset them, where it asks for extrema. memory: the
     observer's. integrals: of the rates that it gives to the steps, see `Observer.follow`, from 0
-    to t. hit: with a clock, the guard that a lane has landed on, as numbered in `instants`, or -1.
+    to t. hit: with a clock, the guard that a lane has landed on, as numbered in `instants`, or that
+    its stick phase ends at, or -1; until: the time when that phase ends, see `holds`.
     """
 
     run: Array
@@ -51,6 +52,7 @@ class Lanes(eqx.Module):
     memory: Any
     integrals: Any = None
     hit: Any = None
+    until: Any = None
 
 
 class Passage(eqx.Module):

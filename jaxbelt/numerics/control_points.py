@@ -8,7 +8,7 @@ after, that it has passed zero once. What else there may be the caller asks of a
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from math import comb
 from typing import NamedTuple
@@ -18,6 +18,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from .compiling import where_any
 from .polynomials import Jet, jet
 
 #: Part of its range that a polynomial may be wrong by, and still be trusted to rise and fall as it
@@ -93,13 +94,27 @@ def highest_difference(points: Sequence[Array]) -> Array:
     return functools.reduce(jnp.add, terms)
 
 
-def passage(curve: Polynomial, doubt: Array, rounding: Array, trust: Array) -> RootPassage:
+def passage(
+    curve: Polynomial, doubt: Array, rounding: Array, trust: Array, keep: Callable[[Array], Array]
+) -> RootPassage:
     """Whether a function comes to zero, of which a polynomial is known.
 
     doubt: how far the polynomial may be off inside; its ends are exact up to `rounding`. trust:
-    where its shape is trusted whatever the doubt, because the way is as short as can be.
+    where its shape is trusted whatever the doubt, because the way is as short as can be. keep:
+    has a value computed once for all of its uses.
     """
     curve, doubt, rounding = lax.stop_gradient((curve, doubt, rounding))
+    points = curve.points
+    above = functools.reduce(jnp.minimum, points[1:]) > doubt + rounding
+    clear = above & (points[0] > -rounding)
+    no = clear & ~clear
+    nothing = RootPassage(no, no, jnp.ones_like(points[0]))
+    found = where_any(~clear, lambda: _passage(curve, doubt, rounding, trust, keep), nothing)
+    return RootPassage(found.once & ~clear, found.cut & ~clear, found.there)
+
+
+def _passage(curve: Polynomial, doubt, rounding, trust, keep) -> RootPassage:
+    """`passage`, where the control points alone do not show that there is none."""
     points = curve.points
     steps = [q - p for p, q in pairwise(points)]
     rises, falls = ([way * d > rounding for d in steps] for way in (1.0, -1.0))
@@ -113,13 +128,12 @@ def passage(curve: Polynomial, doubt: Array, rounding: Array, trust: Array) -> R
     spread = functools.reduce(jnp.maximum, points) - least
     known = trust | (doubt <= TRUSTED * spread + rounding)
     below = points[-1] < -rounding
-    above = functools.reduce(jnp.minimum, points[1:]) > doubt + rounding
     once = known & below & ~(peak & dip)
-    stays = above & (points[0] > -rounding) | known & ~below & ~dip
+    stays = known & ~below & ~dip
     root = _first_passage(points, -rounding)
-    dips = known & ~below & dip & ~peak & ~stays
-    guess = jnp.where(dips, _first_passage([-d for d in steps], rounding), root)
-    theta, lowest = _root_step(curve, guess, dips)
+    dips = known & ~below & dip & ~peak
+    guess = keep(jnp.where(dips, _first_passage([-d for d in steps], rounding), root))
+    theta, lowest = map(keep, _root_step(curve, guess, dips))
     passes = dips & (lowest < -jnp.maximum(doubt, rounding))
     inside = jnp.minimum(theta, 1 - theta) > 1e-3
     splits = dips & ~passes & (lowest <= doubt + rounding) & inside & ~trust

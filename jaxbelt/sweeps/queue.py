@@ -60,10 +60,12 @@ def _oscillators(program: Program, shared, rows: tuple[Array, ...]) -> OwnOscill
     return osc if program.edges else without_edges(osc)
 
 
-def _moves_of(osc: OwnOscillator) -> tuple[Callable, Callable, Callable]:
+def _moves_of(osc: OwnOscillator, observer: Observer) -> tuple[Callable, Callable, Callable]:
     """How lanes go on: `pass_events`, `window_of` and `take_step`, with a clock or without."""
     if has_clock(osc):
-        return clocked.pass_timed_events, clocked.timed_window_of, clocked.take_timed_step
+        jumps = type(observer).follow is Observer.follow
+        pass_events = functools.partial(clocked.pass_timed_events, jumps=jumps)
+        return pass_events, clocked.timed_window_of, clocked.take_timed_step
     return events.pass_events, step.window_of, step.take_step
 
 
@@ -244,7 +246,7 @@ def _work(program: Program, common: Common, stream: Stream, slopes: Sequence[Str
 
     def begin(rows, lanes):
         osc = _oscillators(program, common.shared, rows)
-        pass_events, window_of, _ = _moves_of(osc)
+        pass_events, window_of, _ = _moves_of(osc, observer)
         lanes, passage = pass_events(osc, lanes, t1, rtol, **rules)
         lanes = observer.watch(osc, lanes, passage, ones, t1, rtol)
         return lanes, window_of(osc, lanes, extrema=observer.extrema(lanes))
@@ -252,7 +254,7 @@ def _work(program: Program, common: Common, stream: Stream, slopes: Sequence[Str
     def go(rows, lanes, window):
         osc = _oscillators(program, common.shared, rows)
         atol = in_units(common.atol, osc.units.length, DEFAULT_TOLERANCE)
-        forward = functools.partial(_moves_of(osc)[2], derivatives=program.derivatives)
+        forward = functools.partial(_moves_of(osc, observer)[2], derivatives=program.derivatives)
         return observer.follow(forward, osc, window, ones, lanes, t1, rtol, atol)
 
     rows, rows_slopes = stream.rows, [one.rows for one in slopes]
