@@ -156,7 +156,9 @@ def _focus_difference(case, told, mine):
 
 
 def _state_difference(case, told, mine, tol):
-    far = np.max(np.abs(np.array([told.x1, told.x2]) - mine.y_end))
+    # The relative tolerance allows a state that is large an error as large.
+    size = np.maximum(1.0, np.abs(mine.y_end))
+    far = np.max(np.abs(np.array([told.x1, told.x2]) - mine.y_end) / size)
     # Not `>`: NaN is far.
     states = not far <= STEPS * tol
     if told.events is None or not told.events:
