@@ -51,7 +51,7 @@ from ..numerics.compiling import where_any
 from ..numerics.control_points import Polynomial, highest_difference, passage, through
 from ..results import Status
 from .holds import NEEDED_ROUNDING, Hold, hold_from, is_steady
-from .lanes import Lanes, Passage, choose, materialise
+from .lanes import Lanes, Passage, choose, in_few, materialise
 from .step import (
     LANDING,
     LANDS_WITHIN,
@@ -531,7 +531,39 @@ def pass_timed_events(
     for observers that look at what is between the events.
     """
     landed = (lanes.h < 0) & ~lanes.done
-    fired = landed & (lanes.hit >= 0)
+    no, zero = jnp.zeros_like(landed), jnp.zeros_like(lanes.t)
+    still = Passage(
+        landed=no,
+        fired=no,
+        number=lanes.hit,
+        before=lanes.mode,
+        mode=lanes.mode,
+        t=lanes.t,
+        x1=lanes.x1,
+        x2=lanes.x2,
+        captured=no,
+        rests=no,
+        stuck=no,
+        duration=zero,
+        released=no,
+        forever=no,
+    )
+    bare = replace(lanes, memory=None, integrals=None)
+
+    def go_on(osc, lanes, t1):
+        return _through_guards(osc, lanes, t1, rtol, captures, jumps)
+
+    # Lanes that are not among the few wait until the next time.
+    after, passage = in_few(landed, go_on, (osc, bare, t1), (bare, still))
+    own = dict(memory=lanes.memory, integrals=lanes.integrals)
+    return replace(after, done=after.done | (after.t >= t1), **own), passage
+
+
+def _through_guards(
+    osc: Oscillator, lanes: Lanes, t1, rtol, captures: bool, jumps: bool
+) -> tuple[Lanes, Passage]:
+    """`pass_timed_events` of lanes that have all landed."""
+    fired = lanes.hit >= 0
 
     def through_guard(osc, mode, hit, x1, x2, t):
         after = passed_guard(osc, mode, hit, on_guard_at(osc, mode, hit, (x1, x2, t)))
@@ -540,10 +572,10 @@ def pass_timed_events(
         a = needed_or_rate(osc, codes, t, *after.y[:2])
         return after.y[0], after.y[1], a, codes, after.captured, forever
 
+    args = lanes.mode, lanes.hit, lanes.x1, lanes.x2, lanes.t
     no = jnp.zeros_like(fired)
     state = lanes.x1, lanes.x2, lanes.a, lanes.mode, no, no
-    args = lanes.mode, lanes.hit, lanes.x1, lanes.x2, lanes.t
-    passed = where_any(fired, lambda: of_lanes(through_guard, osc, *args), state)
+    passed = of_lanes(through_guard, osc, *args)
     x1, x2, a, mode, captured, forever = select(fired, passed, state)
     captured = captured & captures
     # Slip onset is tangent: x2' = 0 there up to rounding, for a law without a jump.
@@ -551,7 +583,7 @@ def pass_timed_events(
     changed = any_of([p != q for p, q in zip(lanes.mode.codes, mode.codes, strict=True)])
     happened = fired & changed
     status = jnp.where(captured, Status.PSEUDO_FOCUS.value, lanes.status)
-    status = jnp.where(forever & fired, Status.STUCK_FOREVER.value, status)
+    status = jnp.where(forever, Status.STUCK_FOREVER.value, status).astype(lanes.status.dtype)
     # A stick phase is known beforehand.
     h = jnp.where(fired, jnp.where(mode.any_stuck, LONGEST_STEP, first_step(rtol)), abs(lanes.h))
     after = replace(
@@ -562,19 +594,19 @@ def pass_timed_events(
         h=h,
         pace=jnp.where(fired, STEP_SAFETY / first_step(rtol), lanes.pace),
         mode=mode,
-        events=lanes.events + jnp.where(happened, 1, 0),
+        events=lanes.events + jnp.where(happened, 1, 0).astype(lanes.events.dtype),
         status=status,
-        done=lanes.done | captured,
-        hit=jnp.where(landed, -1, lanes.hit).astype(lanes.hit.dtype),
+        done=captured,
+        hit=jnp.full_like(lanes.hit, -1),
     )
     stuck = released = no
     if is_steady(osc):
-        after = _planned(osc, after, landed, t1)
+        after = _planned(osc, after, t1)
         if jumps:
-            stuck = landed & mode.any_stuck & ~after.done
+            stuck = mode.any_stuck & ~after.done
             after, released = _jumped(osc, after, stuck, t1, rtol)
     passage = Passage(
-        landed=landed,
+        landed=~no,
         fired=happened,
         number=lanes.hit,
         before=lanes.mode,
@@ -587,21 +619,20 @@ def pass_timed_events(
         stuck=stuck,
         duration=after.t - lanes.t,
         released=released,
-        forever=forever & fired,
+        forever=forever,
     )
-    return replace(after, done=after.done | (after.t >= t1)), passage
+    return after, passage
 
 
-def _planned(osc: Oscillator, lanes: Lanes, landed: Array, t1: Array) -> Lanes:
+def _planned(osc: Oscillator, lanes: Lanes, t1: Array) -> Lanes:
     """The lanes with the ends of the stick phases that begin, or go on where the search for their
     ends stopped."""
-    begins = landed & lanes.mode.any_stuck & ~lanes.done
+    begins = lanes.mode.any_stuck & ~lanes.done
     asked = begins & (lanes.status != Status.STUCK_FOREVER.value)
     remaining = t1 - lanes.t
-    state = lanes.mode, asked, lanes.x1, lanes.x2, lanes.t, remaining
+    found = hold_from(osc, lanes.mode, asked, lanes.x1, lanes.x2, lanes.t, remaining)
     never = Hold(remaining, jnp.full_like(lanes.hit, -1))
-    hold = where_any(asked, lambda: hold_from(osc, *state), never)
-    duration, number = select(asked, hold, never)
+    duration, number = select(asked, found, never)
     goes_on = (number < 0) & (duration >= remaining)
     return replace(
         lanes,
@@ -631,7 +662,7 @@ def _jumped(osc: Oscillator, lanes: Lanes, stuck: Array, t1, rtol) -> tuple[Lane
         a=jnp.where(stuck, jnp.where(released, without_rounding(a, x1), a), lanes.a),
         h=h,
         mode=mode,
-        events=lanes.events + jnp.where(released, 1, 0),
+        events=lanes.events + jnp.where(released, 1, 0).astype(lanes.events.dtype),
         hit=jnp.where(released, -1, lanes.hit).astype(lanes.hit.dtype),
     )
     return lanes, released

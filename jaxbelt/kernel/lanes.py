@@ -16,7 +16,11 @@ from jaxtyping import Array
 
 from ..model.modes import Mode
 from ..model.own_units import OwnOscillator
+from ..numerics.compiling import where_any
+from ..numerics.widths import is_cpu
 
+#: Lanes that `in_few` serves at once: of 128 some twenty come to an event between two looks.
+FEW = 32
 #: A motion this large grows beyond all bounds. The cube of a velocity above 5.6e102, which Conti's
 #: law takes, is no longer a number; there steps become ever smaller.
 GROWN = 1e100
@@ -112,6 +116,26 @@ def codes_in(number: Array, belts: int) -> list[Array]:
     return codes
 
 
+def in_few(flags: Array, function: Callable[..., Any], args: Any, otherwise: Any) -> Any:
+    """What a function gives of the first `FEW` lanes that have a flag, and of the others
+    `otherwise`; for what costs more than to pick lanes out. On accelerators of all with a flag.
+
+    args: trees of numbers and arrays [lanes].
+    """
+    if not is_cpu() or flags.size <= 2 * FEW:
+        return choose(flags, where_any(flags, lambda: function(*args), otherwise), otherwise)
+    rank = jnp.cumsum(flags.astype(jnp.int32))
+    chosen = flags & (rank <= FEW)
+
+    def of_few():
+        source = jnp.searchsorted(rank, jnp.arange(1, FEW + 1, dtype=jnp.int32))
+        part = jax.tree.map(lambda x: x.at[source].get(mode="clip") if jnp.ndim(x) else x, args)
+        place = jnp.clip(rank - 1, 0, FEW - 1)
+        return jax.tree.map(lambda x: x[place], function(*part))
+
+    return choose(chosen, where_any(chosen, of_few, otherwise), otherwise)
+
+
 def materialise(value: Array, ones: Array) -> Array:
     """The value, computed once; ones: an array of ones, an argument of the kernel.
 
@@ -145,9 +169,12 @@ class Observer(eqx.Module):
     """What a run hands in, and when it may end early: subclasses are static settings.
 
     variables: what is known of the results, by name, in the order in which datasets show them.
+    steps_while_stuck: whether stick phases under a clock are stepped through, for what looks at
+    moments within them; else they are passed at once, as those without a clock always are.
     """
 
     variables: ClassVar[Mapping[str, Variable]] = {}
+    steps_while_stuck: ClassVar[bool] = False
 
     def extrema(self, lanes: Lanes) -> Array | None:
         """The lanes whose extrema of x2 are wanted, so that steps end at them; None: no lanes."""

@@ -13,7 +13,7 @@ derivatives.
 import functools
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -83,6 +83,7 @@ class _Watched(eqx.Module):
 class Along(Observer):
     """Observer of a reducer with moments or integrals; see `sweep.sweep`."""
 
+    steps_while_stuck: ClassVar[bool] = True
     reducer: Any = eqx.field(static=True)
 
     @property

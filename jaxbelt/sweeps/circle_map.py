@@ -321,6 +321,7 @@ class NextOnset(Observer):
         "slope": Variable("its derivative by the time of the first, and 1"),
         "sign": Variable("of the slip that the run begins with, 0 where it sticks", "int8"),
     }
+    steps_while_stuck: ClassVar[bool] = True
     belt: int = eqx.field(static=True)
 
     def start(self, osc, lanes):

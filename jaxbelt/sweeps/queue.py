@@ -63,7 +63,7 @@ def _oscillators(program: Program, shared, rows: tuple[Array, ...]) -> OwnOscill
 def _moves_of(osc: OwnOscillator, observer: Observer) -> tuple[Callable, Callable, Callable]:
     """How lanes go on: `pass_events`, `window_of` and `take_step`, with a clock or without."""
     if has_clock(osc):
-        jumps = type(observer).follow is Observer.follow
+        jumps = not observer.steps_while_stuck
         pass_events = functools.partial(clocked.pass_timed_events, jumps=jumps)
         return pass_events, clocked.timed_window_of, clocked.take_timed_step
     return events.pass_events, step.window_of, step.take_step

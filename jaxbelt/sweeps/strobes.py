@@ -28,12 +28,11 @@ from ..cycles.clocked import RATIO_ROUNDING, RATIOS
 from ..cycles.exponents import BLOCKS
 from ..cycles.settling import way_left
 from ..kernel.clocked import of_lanes, rate_of_stick
-from ..kernel.lanes import Lanes, Observer, Passage, Variable, choose, materialise
+from ..kernel.lanes import Lanes, Observer, Passage, Variable, choose, in_few, materialise
 from ..model.instants import field_at, guards_at
-from ..model.modes import Mode, mode_acceleration
+from ..model.modes import Mode, any_of, mode_acceleration, select
 from ..model.oscillator import at_time, frequencies
 from ..model.own_units import OwnOscillator
-from ..numerics.compiling import where_any
 from ..numerics.implicit import step_to_root
 from ..results import Status
 from .attractor import EQUILIBRIUM, STUCK_FOR_EVER, UNDECIDED, Attractor
@@ -252,6 +251,7 @@ class ForcedAttractor(Observer):
         "transient": Variable("time at which the attractor was known", dimension="time"),
         "n_events": Variable("number of events (of a periodic motion: in one period)", "int32"),
     }
+    steps_while_stuck: ClassVar[bool] = True
 
     def start(self, osc, lanes):
         zero, count = jnp.zeros_like(lanes.t), jnp.zeros_like(lanes.events)
@@ -522,17 +522,22 @@ def grown(osc, growth: Growth, lanes: Lanes, course: Course, h: Array, ones) -> 
 
 def grown_past(osc, growth: Growth, lanes: Lanes, passage: Passage, t1: Array) -> Growth:
     """The tangent behind the events that were passed, and its growth until now."""
-    before = growth.d1, growth.d2
+    n, tangent = len(osc.belts), (growth.d1, growth.d2)
+    busy = lanes.run >= 0
+    fired, released = passage.fired & busy, passage.released & busy
 
-    def jumped():
-        state = passage.x1, passage.x2, passage.t
-        guards = passage.before, passage.mode, passage.number
-        return of_lanes(_saltation, osc, *guards, state, before)
+    def jumped(osc, passage, state, mode, fired, released, before):
+        first = passage.before, passage.mode, passage.number
+        d = of_lanes(_saltation, osc, *first, (passage.x1, passage.x2, passage.t), before)
+        d = select(fired, d, before)
+        upward = any_of([stuck & (code > 0) for stuck, code in zip(passage.mode.stuck, mode.codes)])
+        number = jnp.where(upward, 3 * n + 1, 3 * n)
+        return select(released, of_lanes(_saltation, osc, passage.mode, mode, number, state, d), d)
 
-    fired = passage.fired & (lanes.run >= 0)
-    after = where_any(fired, jumped, before)
-    d1, d2 = (jnp.where(fired, a, b) for a, b in zip(after, before, strict=True))
-    growth = replace(growth, d1=d1, d2=d2, sticks=growth.sticks | lanes.mode.any_stuck)
+    args = passage, (lanes.x1, lanes.x2, lanes.t), lanes.mode, fired, released, tangent
+    d1, d2 = in_few(fired | released, jumped, (osc, *args), tangent)
+    sticks = growth.sticks | passage.mode.any_stuck | lanes.mode.any_stuck
+    growth = replace(growth, d1=d1, d2=d2, sticks=sticks)
     return _counted(growth, lanes.t, t1)
 
 
