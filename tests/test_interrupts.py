@@ -56,6 +56,20 @@ else:
 sweep(20, 1e6) if sys.argv[1] == "long" else sweep(3000, 300.0)
 """
 COMMAND = "from jaxbelt.cli import app; app()"
+#: The same, ready when the kernel is compiled and the runs begin.
+RUNS = """
+from jaxbelt.cli import app
+from jaxbelt.sweeps import threads
+
+compile_kernel = threads._Team.compile
+
+def told(*given):
+    compile_kernel(*given)
+    print("ready", flush=True)
+
+threads._Team.compile = told
+app()
+"""
 #: Seconds from the interrupt to the end of the process.
 SOON = 2.0
 
@@ -106,8 +120,8 @@ def test_an_interrupt_ends_a_sweep_and_says_what_became_of_it(when, delay):
 def test_an_interrupt_ends_the_command(tmp_path):
     axes = ["nu0=-0.6:0.55:3000", "nu1=-0.5:0.5:3000"]
     out = ["--out", str(tmp_path / "plane.nc")]
-    command = [sys.executable, "-c", HEARS + COMMAND, "sweep", *axes, *out]
-    seconds, code, errors = interrupted(command, 10.0, ready=False, cache=True)
+    command = [sys.executable, "-c", HEARS + RUNS, "sweep", *axes, *out]
+    seconds, code, errors = interrupted(command, 3.0, ready=True, cache=True)
     assert code == 130 and "interrupted after " in errors and "Traceback" not in errors
     assert seconds < SOON
     assert not list(tmp_path.iterdir())

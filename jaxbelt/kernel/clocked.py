@@ -50,7 +50,7 @@ from ..model.oscillator import Oscillator, at_time, fastest, has_possible_number
 from ..numerics.compiling import where_any
 from ..numerics.control_points import Polynomial, highest_difference, passage, through
 from ..results import Status
-from .holds import NEEDED_ROUNDING, Hold, hold_from, is_steady
+from .holds import NEEDED_ROUNDING, FirstEnd, hold_from, is_steady
 from .lanes import Lanes, Passage, choose, in_few, materialise
 from .step import (
     LANDING,
@@ -631,7 +631,7 @@ def _planned(osc: Oscillator, lanes: Lanes, t1: Array) -> Lanes:
     asked = begins & (lanes.status != Status.STUCK_FOREVER.value)
     remaining = t1 - lanes.t
     found = hold_from(osc, lanes.mode, asked, lanes.x1, lanes.x2, lanes.t, remaining)
-    never = Hold(remaining, jnp.full_like(lanes.hit, -1))
+    never = FirstEnd(remaining, jnp.full_like(lanes.hit, -1))
     duration, number = select(asked, found, never)
     goes_on = (number < 0) & (duration >= remaining)
     return replace(

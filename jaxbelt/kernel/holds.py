@@ -34,16 +34,16 @@ from .waves import cosine_and_sine
 #: Rounding of what is needed, over its size.
 NEEDED_ROUNDING = 1e-13
 #: Newton's method is left alone with a root where bend f <= `SAFE` s^2: by Kantorovich's theorem
-#: each step then leaves less than the square of twice that, and `NEWTON_STEPS` leave rounding.
-SAFE, NEWTON_STEPS = 1 / 32, 4
+#: each step then leaves less than the square of twice that, and `LAST_NEWTON_STEPS` leave rounding.
+SAFE, LAST_NEWTON_STEPS = 1 / 32, 4
 #: Steps of a search; where they do not reach the end, the rest is asked for again.
-MOST_STEPS = 64
+MOST_PARABOLAS = 64
 #: The bend of a straight line.
-STRAIGHT = 1e-300
+NO_BEND = 1e-300
 
 
-class Hold(NamedTuple):
-    """A stick phase, arrays [lanes].
+class FirstEnd(NamedTuple):
+    """The end of a stick phase, arrays [lanes].
 
     duration: until its end, or as far as there is none; number: the guard that ends it, as in
     `instants.guards_at`, -1 where none has been found.
@@ -60,7 +60,7 @@ def is_steady(osc: Oscillator) -> bool:
     return waves and not any(isinstance(number, Oscillating) for number in numbers)
 
 
-def hold_from(osc: Oscillator, mode: Mode, asked: Array, x1, x2, t, remaining) -> Hold:
+def hold_from(osc: Oscillator, mode: Mode, asked: Array, x1, x2, t, remaining) -> FirstEnd:
     """The stick phases of the lanes that are asked for, up to the remaining time.
 
     Args:
@@ -75,7 +75,7 @@ def hold_from(osc: Oscillator, mode: Mode, asked: Array, x1, x2, t, remaining) -
     n, now = len(osc.belts), at_time(osc, t)
     waves = [_wave(osc, one, t) for one in osc.forcing if not isinstance(one, ConstantForce)]
     limit, zero = capacity(now, mode), jnp.zeros_like(x1)
-    bend = sum((jnp.abs(a) * w * w for a, w, _ in waves), zero + STRAIGHT)
+    bend = sum((jnp.abs(a) * w * w for a, w, _ in waves), zero + NO_BEND)
     fuzz = NEEDED_ROUNDING * blur(t) * (1 + limit + jnp.abs(x1))
     rest = mode_acceleration(now, mode, x1, x2)
     rest = rest - sum((a * cosine_and_sine(theta)[0] for a, _, theta in waves), zero)
@@ -125,22 +125,22 @@ def hold_from(osc: Oscillator, mode: Mode, asked: Array, x1, x2, t, remaining) -
         return tau, going & (tau < horizon), ends, side, steps + 1
 
     def is_going(state):
-        return jnp.any(state[1]) & (state[-1] < MOST_STEPS)
+        return jnp.any(state[1]) & (state[-1] < MOST_PARABOLAS)
 
     start = zero, asked & (horizon > 0), zero > 0, zero, jnp.zeros((), int)
     tau, going, ends, side, _ = lax.while_loop(is_going, go_on, start)
-    for _ in range(NEWTON_STEPS):
+    for _ in range(LAST_NEWTON_STEPS):
         needed, rate = needed_at(tau)
         value, slope = limit + side * needed, side * rate
         way = jnp.where(ends, -value / jnp.where(ends, slope, 1.0), 0.0)
         tau = jnp.maximum(tau + way, 0.0)
     # Where a limit and an edge are at one place but for rounding, what is beyond the edge decides.
-    rounding = fuzz / jnp.maximum(jnp.abs(x2), STRAIGHT)
+    rounding = fuzz / jnp.maximum(jnp.abs(x2), NO_BEND)
     at_edge = ~going & (to_edge <= remaining) & (~ends | (to_edge <= tau + rounding))
     at_limit = ends & ~at_edge & (tau <= remaining)
     number = jnp.where(at_limit, jnp.where(side < 0, 3 * n, 3 * n + 1), -1)
     number = jnp.where(at_edge, edge, number).astype(jnp.int32)
-    return Hold(jnp.where(at_edge, to_edge, jnp.minimum(tau, remaining)), number)
+    return FirstEnd(jnp.where(at_edge, to_edge, jnp.minimum(tau, remaining)), number)
 
 
 def _wave(osc: Oscillator, force, t: Array) -> tuple[Array, Array, Array]:

@@ -20,7 +20,7 @@ from ..numerics.compiling import where_any
 from ..numerics.widths import is_cpu
 
 #: Lanes that `in_few` serves at once: of 128 some twenty come to an event between two looks.
-FEW = 32
+SERVED = 32
 #: A motion this large grows beyond all bounds. The cube of a velocity above 5.6e102, which Conti's
 #: law takes, is no longer a number; there steps become ever smaller.
 GROWN = 1e100
@@ -117,20 +117,20 @@ def codes_in(number: Array, belts: int) -> list[Array]:
 
 
 def in_few(flags: Array, function: Callable[..., Any], args: Any, otherwise: Any) -> Any:
-    """What a function gives of the first `FEW` lanes that have a flag, and of the others
+    """What a function gives of the first `SERVED` lanes that have a flag, and of the others
     `otherwise`; for what costs more than to pick lanes out. On accelerators of all with a flag.
 
     args: trees of numbers and arrays [lanes].
     """
-    if not is_cpu() or flags.size <= 2 * FEW:
+    if not is_cpu() or flags.size <= 2 * SERVED:
         return choose(flags, where_any(flags, lambda: function(*args), otherwise), otherwise)
     rank = jnp.cumsum(flags.astype(jnp.int32))
-    chosen = flags & (rank <= FEW)
+    chosen = flags & (rank <= SERVED)
 
     def of_few():
-        source = jnp.searchsorted(rank, jnp.arange(1, FEW + 1, dtype=jnp.int32))
+        source = jnp.searchsorted(rank, jnp.arange(1, SERVED + 1, dtype=jnp.int32))
         part = jax.tree.map(lambda x: x.at[source].get(mode="clip") if jnp.ndim(x) else x, args)
-        place = jnp.clip(rank - 1, 0, FEW - 1)
+        place = jnp.clip(rank - 1, 0, SERVED - 1)
         return jax.tree.map(lambda x: x[place], function(*part))
 
     return choose(chosen, where_any(chosen, of_few, otherwise), otherwise)
