@@ -89,7 +89,9 @@ def sweep(
         Path,
         typer.Option(
             help="Where to write: NetCDF if it ends in .nc; if in .zarr, a store, from which the "
-            "same command goes on where it was interrupted. Folders that are missing are made."
+            "same command goes on where it was interrupted. A store of a machine is in the "
+            "oscillator's own units; the whole is written in SI units to the same name with .nc. "
+            "Folders that are missing are made."
         ),
     ] = Path("sweep.nc"),
     blocks: Annotated[
@@ -148,15 +150,14 @@ def sweep(
         drawn = part is None and sum(len(axis) > 1 for axis in values.values()) in (1, 2)
         check_word("variable", shown, [name for name in known[observe] if name not in OF_BELTS])
         machine = described.machine
-        if machine and out.suffix == ".zarr":
-            expected = "a store keeps dimensionless numbers"
-            raise ValueError(f"out of a machine must end in .nc, as {expected}, got {out}")
+        # A store is complete, and so can be converted, where no blocks are asked for.
+        file = out.with_suffix(".nc") if machine and part is None else out
         y0 = described.start(start)
         asked: dict[str, Any] = dict(y0=y0, observe=observe, **tolerances(tolerance))
         if t1 is not None:
             check_number("t1", t1)
-        if out.suffix == ".nc":
-            check_out(out)
+        if file.suffix == ".nc":
+            check_out(file)
         check_out(out.with_suffix(".png"))
         turn_on_float64()
         own = [name for name in values if name not in ("x1", "x2")]
@@ -171,21 +172,21 @@ def sweep(
             estimate = jb.explain(make, values, **asked)
             say([repr(estimate)], as_json=as_json, data=asdict(estimate))
             return
-        if out.suffix == ".zarr":
-            dataset = jb.sweep(make, values, **asked, store=out, blocks=part)
-        else:
-            dataset = jb.sweep(make, values, **asked)
+        store = dict(store=out, blocks=part) if out.suffix == ".zarr" else {}
+        dataset = jb.sweep(make, values, **asked, **store)
+        written = [out]
+        if file.suffix == ".nc":
             if described.source and machine:
                 dataset = _of_machine(dataset, described.source, own, y0)
-            out.parent.mkdir(parents=True, exist_ok=True)
+            file.parent.mkdir(parents=True, exist_ok=True)
             # Version 3 of the format needs no library but SciPy.
-            dataset.to_netcdf(out, engine="scipy")
-        written = [out]
+            dataset.to_netcdf(file, engine="scipy")
+            written = [*dict.fromkeys((out, file))]
         if drawn:
             written.append(out.with_suffix(".png"))
             from ..plotting.sweeps import plot_sweep
 
-            with picture(written[1], 4.6, 4.4) as figure:
+            with picture(written[-1], 4.6, 4.4) as figure:
                 plot_sweep(dataset, shown, figure.subplots())
     say([repr(dataset)], written, as_json=as_json, data=_counts_as_data(dataset))
 
