@@ -421,14 +421,18 @@ def _beyond_point(
             if not line.first <= there <= line.last:
                 continue
             osc = line.at(there)
-            own = last.motion.at(osc) if side < 0 else None
+            own = last.motion.at(osc)
             for stretch in (0.0, part, -part):
                 motion = periodic_from(osc, at + stretch * moved, periods, line.turns)
                 fine = int(motion.status) == Status.OK and motion.periods == periods
                 if not fine or np.max(np.abs(np.asarray(motion.start) - at)) > NEAR_POINT:
                     continue
                 row = MotionRow(there, motion)
-                same = own is not None and is_same_motion(own, motion)
+                if side < 0:
+                    same = is_same_motion(own, motion)
+                else:
+                    # Within rounding of the point the signature that has ended still solves.
+                    same = motion.signature == last.motion.signature
                 if not same and MotionLeg.begun(line, row)[1].found:
                     return row, side * direction
     return None

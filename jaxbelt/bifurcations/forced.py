@@ -467,7 +467,9 @@ class SwitchingSliding(_AtArrival):
 class AddingSliding(AbstractForcedCondition):
     """Inside a stick phase the force that is needed touches what the belt can hold.
 
-    Beyond the point the phase is two: in between the mass slips and sticks again.
+    Beyond the point the phase is two: in between the mass slips and sticks again. Where the belt's
+    static friction is above its kinetic friction the slip is not short; then a phase that ends
+    touches there, and beyond the point it goes on.
 
     Args:
         belt: Number of the belt.
@@ -502,6 +504,16 @@ class AddingSliding(AbstractForcedCondition):
             if rows.codes[row, k] == STUCK:
                 cut = rows.cut(row, since, state, names.nearest_limit)
                 yield Beginning(cut, value, system(row, rows.codes[row]))
+        for row in range(len(rows.ends) - 1):
+            here, after = rows.codes[row : row + 2]
+            if rows.ends[row] == names.onset and here[k] == STUCK and abs(after[k]) == 1:
+                y = jnp.asarray(rows.z[row + 1, :3])
+                if abs(float(_guard_slopes(osc, jnp.asarray(after), y)[k])) > SMALLEST_JUMP:
+                    _, rate = _excess(osc, jnp.asarray(here), y)
+                    ends = rows.ends.copy()
+                    ends[row] = names.nearest_limit
+                    touching = rows._replace(ends=ends)
+                    yield Beginning(touching, float(rate) ** 2, system(row, here))
 
 
 def _left_out(rows: ArcRows, short: list[int], end: int) -> Iterator[tuple[ArcRows, int, float]]:

@@ -27,6 +27,7 @@ from ..model.instants import (
     GUARD_ROUNDING,
     TimedState,
     Trend,
+    blur,
     carried,
     field_at,
     guard_sizes,
@@ -38,6 +39,7 @@ from ..model.instants import (
 from ..model.modes import Mode, select
 from ..model.oscillator import Oscillator, fastest
 from ..numerics.extrapolation import increments, scheme
+from ..numerics.implicit import step_to_root
 from ..numerics.roots import first_root
 from .arcs import ArcEnd
 
@@ -49,6 +51,9 @@ SHORTEST_STEP = 1e-8
 QUINTIC_SHARE = 0.25
 #: A guard above minus this, times `guard_sizes`, has not passed zero.
 TOUCH = 0.1 * GUARD_ROUNDING
+#: Newton steps for the root beside a zero at which an arc began; and the shortest such arc, times
+#: `blur` of the time, at whose end the guard falls beyond rounding.
+STEPS_BESIDE_ZERO, SHORTEST_BESIDE_ZERO = 4, 1e-11
 #: Steps before an arc is given up.
 MOST_TIMED_STEPS = 20_000
 #: Longest slip arc; longer ones are cut.
@@ -190,10 +195,39 @@ def first_vanishing(osc: Oscillator, mode: Mode, y: TimedState, longest: Array, 
     h, number = first_root(guards, at_start, length, at_end, extrema=0)
     number = jnp.where(last.hit, number, -1)
     h = jnp.where(number >= 0, h, length)
-    y, _ = _stepped(osc, mode, last.y, h)
-    y = select(last.hit, y, last.y)
+    y_end, _ = _stepped(osc, mode, last.y, h)
+    y_end = select(last.hit, y_end, last.y)
     failed = last.failed | (last.steps >= MOST_TIMED_STEPS)
-    return last.passed + h, y, number, failed
+    beside = (number >= 0) & (last.shifts[number] > 0)
+    duration = _beside_zero(osc, mode, y, number, last.passed + h, beside)
+    y_end = select(beside, _stepped(osc, mode, y, duration)[0], y_end)
+    return duration, y_end, number, failed
+
+
+def _beside_zero(
+    osc: Oscillator, mode: Mode, y: TimedState, number: Array, duration: Array, asked: Array
+) -> Array:
+    """When a guard that is zero at y vanishes again, near to `duration`, where that is asked.
+
+    Its value is rounding all the time, its slope is not: the mean slope vanishes there.
+    """
+    shortest = jnp.minimum(SHORTEST_BESIDE_ZERO * blur(y[2]), duration)
+
+    def slope(h):
+        return guards_trend(osc, mode, _stepped(osc, mode, y, h)[0]).slope[number]
+
+    def nearer(state):
+        h, steps = state
+        first, middle, last = slope(0.0 * h), slope(0.5 * h), slope(h)
+        mean = (first + 4 * middle + last) / 6
+        change = step_to_root(mean, (last - mean) / h, where=last < mean)
+        return jnp.clip(h + change, shortest, duration), steps + 1
+
+    def is_going(state):
+        return asked & (state[1] < STEPS_BESIDE_ZERO)
+
+    found, _ = lax.while_loop(is_going, nearer, (duration, jnp.asarray(0)))
+    return found
 
 
 class TimedArc(eqx.Module):
