@@ -30,6 +30,7 @@ from ..results import Status
 from .base import AbstractCondition, BifurcationPoint
 from .crossings import CrossingSliding
 from .forced import (
+    SMALLEST_JUMP,
     AbstractForcedCondition,
     AddingSliding,
     Fold,
@@ -411,6 +412,8 @@ def _beyond_point(
 ) -> tuple[MotionRow, float] | None:
     """A motion beyond the point in which a signature ended, and the sense in which to go on;
     direction: the sign is that in which the parameter went."""
+    if _jumps_at(point):
+        return None
     direction = float(np.sign(direction))
     at, value = np.asarray(point.cycle.start), float(point.value)
     periods = last.motion.periods
@@ -436,6 +439,15 @@ def _beyond_point(
                 if not same and MotionLeg.begun(line, row)[1].found:
                     return row, side * direction
     return None
+
+
+def _jumps_at(point: BifurcationPoint) -> bool:
+    """Whether a motion only touches there, and friction jumps: to one side of the point the belt
+    holds, or lets go, for a time that is not short. So the branch ends."""
+    if not isinstance(point.condition, AddingSliding | GrazingSliding):
+        return False
+    law = point.oscillator.belts[int(point.condition.belt)].friction
+    return float(law.static - law.mu(jnp.zeros(()))) > SMALLEST_JUMP
 
 
 def _other_branch(

@@ -726,6 +726,26 @@ def _slip_root(z, w, B, F, s, L, line, order, shift, t, x1, x2, a, right, f_left
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
+def _slip_root_beside(z, w, B, F, s, L, line, t, x1, x2, a, right, V, K):
+    """As `_stick_root_beside`; the length and the state there."""
+    _, first, _ = _slip_line(z, w, B, F, s, L, line, t, x1, x2, a)
+    left, end = 0.0, right
+    for _ in range(60):
+        h = 0.5 * (left + right)
+        y1, y2 = _advance(z, w, B, F, s, t, x1, x2, a, 0.5 * h, V, K)
+        _, middle, _ = _slip_line(z, w, B, F, s, L, line, t + 0.5 * h, y1, y2, K[_N])
+        y1, y2 = _advance(z, w, B, F, s, t, x1, x2, a, h, V, K)
+        _, last, _ = _slip_line(z, w, B, F, s, L, line, t + h, y1, y2, K[_N])
+        if first + 4 * middle + last > 0:
+            left = h
+        else:
+            right = h
+    h = min(max(right, 1e-11 * _blur(t)), end)
+    y1, y2 = _advance(z, w, B, F, s, t, x1, x2, a, h, V, K)
+    return h, y1, y2
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
 def _stick_line(z, w, B, F, s, k, start, x1, L, line, t, h, R):
     """Bounds of a distance of a stick phase, of its slope and curvature over [t, t + h], into R.
 
@@ -836,6 +856,27 @@ def _stick_root(z, w, B, F, s, k, start, x1, L, line, order, shift, left, right,
             return t
         t = new
     return t
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _stick_root_beside(z, w, B, F, s, k, start, x1, L, line, right, R):
+    """The root up to the time `right` of a distance that is zero at `start`.
+
+    All its values in between are rounding; its mean slope, which also vanishes there, is not.
+    """
+    _stick_line(z, w, B, F, s, k, start, x1, L, line, start, 0.0, R)
+    first = R[2]
+    left, end = start, right
+    for _ in range(60):
+        t = 0.5 * (left + right)
+        _stick_line(z, w, B, F, s, k, start, x1, L, line, 0.5 * (start + t), 0.0, R)
+        middle = R[2]
+        _stick_line(z, w, B, F, s, k, start, x1, L, line, t, 0.0, R)
+        if first + 4 * middle + R[2] > 0:
+            left = t
+        else:
+            right = t
+    return min(max(right, start + 1e-11 * _blur(start)), end)
 
 
 # ---------------------------------------------------------------- transitions
@@ -1125,6 +1166,8 @@ def _stick_phase(z, w, B, F, s, k, start, x1, T, period, L, shifts, R, Q):
             h *= 0.5
             continue
         if hit >= 0:
+            if shifts[hit] > 0:
+                t_hit = _stick_root_beside(z, w, B, F, s, k, start, x1, L, hit, t_hit, Q)
             return hit, t_hit, margin, False
         margin = min(margin, closest)
         t = until if h == until - t else T if h == T - t else t + h
@@ -1230,7 +1273,7 @@ def _run(z, w, B, F, period, x1, x2, given, t, T, tol, noise, seed, out):
                 g, d, _ = _slip_line(z, w, B, F, s, L, line, t, x1, x2, a)
                 if abs(g) <= _ROUNDING * size:
                     shifts[line] = 2 * _ROUNDING * size
-            h = 0.02
+            h, begun = 0.02, t
             hit, h_hit, m1, m2 = -1, 0.0, 0.0, 0.0
             while t < T:
                 steps += 1
@@ -1311,6 +1354,10 @@ def _run(z, w, B, F, period, x1, x2, given, t, T, tol, noise, seed, out):
                                     z, w, B, F, s, L, line, 0, shift,
                                     t, x1, x2, a, right, g0, f_right, V2, K2,
                                 )  # fmt: skip
+                                if shift > 0 and t == begun:
+                                    length, p1, p2 = _slip_root_beside(
+                                        z, w, B, F, s, L, line, t, x1, x2, a, length, V2, K2
+                                    )
                                 if hit < 0 or length < h_hit:
                                     hit, h_hit, m1, m2 = line, length, p1, p2
                         if not unclear and hit < 0:
