@@ -228,6 +228,23 @@ def test_a_stick_phase_ends_at_the_first_root_of_its_limits(meeting):
             assert t == pytest.approx(onset, abs=within)
 
 
+@pytest.mark.parametrize("early", [1e-9, 1e-8, 1e-7, 1e-6, 1e-4])
+def test_an_edge_from_which_a_belt_carries_the_mass_and_back_is_met_at_once(early):
+    """The way from the edge and back is rounding, early^2 / 8; the belt reverses `early` later."""
+    belt = jb.Belt(jb.Oscillating(0.0, 0.25, 1.0), jb.Coulomb(2.0, 1.0), 1.0, lower=0.9)
+    osc, t0 = jb.Oscillator(0.0, (belt,), forcing=jb.Harmonic(1e-3, 2.0)), pi / 2 - early
+    run = jb.simulate(osc, (0.9, 0.25 * cos(t0)), t0 + 1.0, t0=t0)
+    assert float(run.events.t[0]) - t0 == pytest.approx(2 * (pi / 2 - t0), abs=1e-14, rel=1e-6)
+
+
+@pytest.mark.parametrize("speed", [1e-10, 1e-8, 1e-6])
+def test_an_edge_from_which_a_mass_slips_and_back_is_met_at_once(speed):
+    belt = jb.Belt(jb.Oscillating(0.5, 0.25, 1.0), jb.Coulomb(0.5, 0.5), 1.0, lower=0.9)
+    osc = jb.Oscillator(0.0, (belt,), forcing=jb.Harmonic(1e-3, 2.0, pi / 2))
+    run = jb.simulate(osc, (0.9, speed), 1.0)
+    assert float(run.events.t[0]) == pytest.approx(2 * speed / 0.4, rel=1e-3 + 10 * speed)
+
+
 def test_a_belt_at_rest_holds_for_ever_only_within_its_capacity():
     osc = forced_one(velocity=0.0, forcing=jb.Harmonic(0.5, 1.3))
     held = jb.simulate(osc, (0.15, 0.0), 50.0, ts=[50.0])

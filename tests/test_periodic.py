@@ -290,6 +290,33 @@ def test_a_stick_phase_ends_where_the_limit_is_reached_first():
     assert int(motion.status) == jb.Status.NOT_ADMISSIBLE
 
 
+@pytest.mark.slow(first=True)
+def test_a_branch_ends_where_a_stick_phase_ends_by_touching():
+    """Static friction above kinetic friction: beyond the point the phase goes on. The oscillator is
+    its own mirror image, half a period later."""
+    law, force = jb.Coulomb(1.0, 0.5), jb.Harmonic(0.5, 0.5, np.pi)
+    values = []
+    for sign, guess in ((1.0, (-0.6318, -0.2265)), (-1.0, (-0.1698, -0.31))):
+        osc = jb.Oscillator(0.2, (jb.Belt(0.26 * sign, law, 0.5),), 2.0, forcing=force)
+        start, span = jb.periodic(osc, guess), tuple(sorted([0.258 * sign, 0.262 * sign]))
+        found = jb.bifurcation_diagram(
+            osc, lambda osc: osc.belts[0].velocity, span, rows=8, start=start
+        )
+        assert not found.open_ends
+        (point,), (branch,) = found.points, found.branches
+        assert point.kind == "AddingSliding"
+        values.append(float(point.value))
+        assert np.max(np.abs(branch.values)) < abs(values[-1])
+        for off, comes_back in ((-1e-7, True), (1e-7, False)):
+            belt = forced.Belt(values[-1] + sign * off, ("coulomb", 1.0, 0.5), 0.5)
+            wave = forced.Harmonic(0.5, 0.5, np.pi)
+            of_engine = forced.Oscillator(0.2, (belt,), (wave,), 2.0)
+            first = np.asarray(point.cycle.start)
+            away = np.subtract(forced_cases.stroboscopic(of_engine, first, 1).y_end, first)
+            assert (np.max(np.abs(away)) < 1e-2) == comes_back
+    assert values[1] == pytest.approx(-values[0], abs=1e-10)
+
+
 def test_no_number_depends_on_the_unit_of_length(sticking):
     law = jb.Cubic(1.5, 1.5 / 4, 0.45 / 64)
     belt, force = jb.Belt(4.0, law, 4.0), jb.Harmonic(0.4, 1.68)
