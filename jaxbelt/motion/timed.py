@@ -53,12 +53,12 @@ QUINTIC_SHARE = 0.25
 TOUCH = 0.1 * GUARD_ROUNDING
 #: Newton steps for the root beside a zero at which an arc began; and the shortest such arc, times
 #: `blur` of the time, at whose end the guard falls beyond rounding.
-STEPS_BESIDE_ZERO, SHORTEST_BESIDE_ZERO = 4, 1e-11
+STEPS_BESIDE_ZERO, SHORTEST_BESIDE_ZERO = 6, 1e-11
 #: Steps before an arc is given up.
 MOST_TIMED_STEPS = 20_000
 #: Longest slip arc; longer ones are cut.
 LONGEST_TIMED_ARC = 1.0
-_BOTH_ORDERS = scheme((2, 4, 6, 8), (2, 4, 6))
+_BOTH_ORDERS, _BESIDE_ZERO = scheme((2, 4, 6, 8), (2, 4, 6)), scheme((2, 4), (2,))
 
 
 class _March(NamedTuple):
@@ -77,10 +77,10 @@ class _March(NamedTuple):
     steps: Array
 
 
-def _stepped(osc: Oscillator, mode: Mode, y: TimedState, h: Array):
+def _stepped(osc: Oscillator, mode: Mode, y: TimedState, h: Array, orders=_BOTH_ORDERS):
     """The state a time h later, and an estimate of its error in x1 and x2."""
     field = functools.partial(field_at, osc, mode)
-    best, lower = increments(field, y, h, _BOTH_ORDERS)
+    best, lower = increments(field, y, h, orders)
     slipped = y[0] + best[0], y[1] + best[1], y[2] + best[2]
     errors = tuple(jnp.abs(a - b) for a, b in zip(best[:2], lower[:2], strict=True))
     stuck = mode.any_stuck
@@ -198,36 +198,28 @@ def first_vanishing(osc: Oscillator, mode: Mode, y: TimedState, longest: Array, 
     y_end, _ = _stepped(osc, mode, last.y, h)
     y_end = select(last.hit, y_end, last.y)
     failed = last.failed | (last.steps >= MOST_TIMED_STEPS)
+    # Beside a zero at which the arc began a guard's value is rounding all the time, its slope is
+    # not: where the guard vanishes again its mean slope does, here that of a cubic.
     beside = (number >= 0) & (last.shifts[number] > 0)
-    duration = _beside_zero(osc, mode, y, number, last.passed + h, beside)
-    y_end = select(beside, _stepped(osc, mode, y, duration)[0], y_end)
-    return duration, y_end, number, failed
-
-
-def _beside_zero(
-    osc: Oscillator, mode: Mode, y: TimedState, number: Array, duration: Array, asked: Array
-) -> Array:
-    """When a guard that is zero at y vanishes again, near to `duration`, where that is asked.
-
-    Its value is rounding all the time, its slope is not: the mean slope vanishes there.
-    """
-    shortest = jnp.minimum(SHORTEST_BESIDE_ZERO * blur(y[2]), duration)
-
-    def slope(h):
-        return guards_trend(osc, mode, _stepped(osc, mode, y, h)[0]).slope[number]
+    longest = last.passed + h
+    shortest = jnp.minimum(SHORTEST_BESIDE_ZERO * blur(y[2]), longest)
 
     def nearer(state):
-        h, steps = state
-        first, middle, last = slope(0.0 * h), slope(0.5 * h), slope(h)
-        mean = (first + 4 * middle + last) / 6
-        change = step_to_root(mean, (last - mean) / h, where=last < mean)
-        return jnp.clip(h + change, shortest, duration), steps + 1
+        duration, _, steps = state
+        y_end, _ = _stepped(osc, mode, y, duration, _BESIDE_ZERO)
+        end = look(y_end)
+        first, final = at.slope[number], end.slope[number]
+        bends = at.curvature[number] - end.curvature[number]
+        mean = 0.5 * (first + final) + duration * bends / 12
+        change = step_to_root(mean, (final - mean) / duration, where=final < mean)
+        return jnp.clip(duration + change, shortest, longest), y_end, steps + 1
 
     def is_going(state):
-        return asked & (state[1] < STEPS_BESIDE_ZERO)
+        return beside & (state[-1] < STEPS_BESIDE_ZERO)
 
-    found, _ = lax.while_loop(is_going, nearer, (duration, jnp.asarray(0)))
-    return found
+    begun = longest, y_end, jnp.asarray(0)
+    duration, y_end, _ = lax.while_loop(is_going, nearer, begun)
+    return duration, y_end, number, failed
 
 
 class TimedArc(eqx.Module):
