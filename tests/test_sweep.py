@@ -23,6 +23,7 @@ from jaxbelt import Status
 from jaxbelt.cli import app
 from jaxbelt.kernel.lanes import Observer, Variable
 from jaxbelt.kernel.marks import Mark, code_of
+from jaxbelt.numerics import programs
 from jaxbelt.numerics.widths import SideBySide
 from jaxbelt.sweeps import store, threads
 from jaxbelt.sweeps.question import Question
@@ -430,12 +431,16 @@ def test_audits_find_repeats_that_are_none(observe, monkeypatch):
         return same & (abs(lanes.x1 - mark.x1) <= close)
 
     monkeypatch.setattr(Mark, "met_by", in_part)
+    # A kept program would be one without the change, or be kept with it.
+    monkeypatch.setattr(programs, "ON", False)
+    programs.are_kept.cache_clear()
     threads.compiled.cache_clear()
     with pytest.warns(UserWarning, match="1 of 9 audited runs differ .* indices \\(2, 0\\)"):
         found = jb.sweep(
             jb.presets.class_b, AUDITED, t1=60.0, observe=observe, audit=1.0, progress=False
         )
     threads.compiled.cache_clear()
+    programs.are_kept.cache_clear()
     assert found.attrs["audit_differed"] == 1
 
 
