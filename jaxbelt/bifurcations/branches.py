@@ -30,13 +30,13 @@ from ..results import Status
 from .base import AbstractCondition, BifurcationPoint
 from .crossings import CrossingSliding
 from .forced import (
-    SMALLEST_JUMP,
     AbstractForcedCondition,
     AddingSliding,
     Fold,
     PeriodDoubling,
     SwitchingSliding,
     Torus,
+    friction_jumps,
     motion_between_halves,
 )
 from .systems import WEIGHT
@@ -424,18 +424,16 @@ def _beyond_point(
             if not line.first <= there <= line.last:
                 continue
             osc = line.at(there)
-            own = last.motion.at(osc)
+            own = last.motion.at(osc) if side < 0 else None
             for stretch in (0.0, part, -part):
                 motion = periodic_from(osc, at + stretch * moved, periods, line.turns)
                 fine = int(motion.status) == Status.OK and motion.periods == periods
                 if not fine or np.max(np.abs(np.asarray(motion.start) - at)) > NEAR_POINT:
                     continue
                 row = MotionRow(there, motion)
-                if side < 0:
-                    same = is_same_motion(own, motion)
-                else:
-                    # Within rounding of the point the signature that has ended still solves.
-                    same = motion.signature == last.motion.signature
+                # Beyond the point the signature that has ended may still solve, by rounding.
+                ended = motion.signature == last.motion.signature
+                same = ended if own is None else is_same_motion(own, motion)
                 if not same and MotionLeg.begun(line, row)[1].found:
                     return row, side * direction
     return None
@@ -444,10 +442,9 @@ def _beyond_point(
 def _jumps_at(point: BifurcationPoint) -> bool:
     """Whether a motion only touches there, and friction jumps: to one side of the point the belt
     holds, or lets go, for a time that is not short. So the branch ends."""
-    if not isinstance(point.condition, AddingSliding | GrazingSliding):
-        return False
-    law = point.oscillator.belts[int(point.condition.belt)].friction
-    return float(law.static - law.mu(jnp.zeros(()))) > SMALLEST_JUMP
+    condition = point.condition
+    touches = isinstance(condition, AddingSliding | GrazingSliding)
+    return touches and friction_jumps(point.oscillator, int(condition.belt))
 
 
 def _other_branch(

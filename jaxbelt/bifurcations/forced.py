@@ -60,7 +60,7 @@ TRIED = 3
 AT_ONSET = 1e-6
 #: Arcs whose durations differ by a smaller part may be images of one another.
 ALIKE_ARCS = 0.1
-#: Smaller jumps between static and kinetic friction, in own units, are none.
+#: Smaller jumps between static and kinetic friction, and of what they do in own units, are none.
 SMALLEST_JUMP = 1e-6
 #: States from which motions are looked for, in own units.
 STARTS_OF_MOTIONS = (
@@ -89,6 +89,12 @@ class ArcRows(NamedTuple):
         used = np.asarray(motion.chain.used)
         parts = motion.chain.codes, motion.chain.ends, motion.unknowns
         return cls(*(np.asarray(part)[used] for part in parts))
+
+    def ending(self, row: int, end: int) -> "ArcRows":
+        """With another end of the arc of a row."""
+        ends = self.ends.copy()
+        ends[row] = end
+        return self._replace(ends=ends)
 
     def put(self, first: int, last: int, *rows: tuple[Any, Any, Any]) -> "ArcRows":
         """With (codes, end, unknowns) in place of the arcs from the first up to the last one."""
@@ -367,9 +373,8 @@ class TimedGrazing(AbstractForcedCondition):
             if rows.ends[row] == k and abs(before[k]) == 1 and after[k] == STUCK:
                 speed = self._jump_at(osc, before, after, jnp.asarray(rows.z[row + 1, :3]))
                 if speed is not None:
-                    ends = rows.ends.copy()
-                    ends[row] = names.tangent + k
-                    yield Beginning(rows._replace(ends=ends), speed**2, system(row))
+                    touching = rows.ending(row, names.tangent + k)
+                    yield Beginning(touching, speed**2, system(row))
 
     def _jump_at(self, osc: Oscillator, before: Any, after: Any, y: Array) -> float | None:
         """How fast a mass comes to the boundary at which it begins to stick; None where the law of
@@ -504,16 +509,18 @@ class AddingSliding(AbstractForcedCondition):
             if rows.codes[row, k] == STUCK:
                 cut = rows.cut(row, since, state, names.nearest_limit)
                 yield Beginning(cut, value, system(row, rows.codes[row]))
-        for row in range(len(rows.ends) - 1):
+        for row in range(len(rows.ends) - 1 if friction_jumps(osc, k) else 0):
             here, after = rows.codes[row : row + 2]
             if rows.ends[row] == names.onset and here[k] == STUCK and abs(after[k]) == 1:
-                y = jnp.asarray(rows.z[row + 1, :3])
-                if abs(float(_guard_slopes(osc, jnp.asarray(after), y)[k])) > SMALLEST_JUMP:
-                    _, rate = _excess(osc, jnp.asarray(here), y)
-                    ends = rows.ends.copy()
-                    ends[row] = names.nearest_limit
-                    touching = rows._replace(ends=ends)
-                    yield Beginning(touching, float(rate) ** 2, system(row, here))
+                _, rate = _excess(osc, jnp.asarray(here), jnp.asarray(rows.z[row + 1, :3]))
+                touching = rows.ending(row, names.nearest_limit)
+                yield Beginning(touching, float(rate) ** 2, system(row, here))
+
+
+def friction_jumps(osc: Oscillator, belt: int) -> bool:
+    """Whether a belt's static friction is above its kinetic friction."""
+    law = osc.belts[belt].friction
+    return float(law.static - law.mu(jnp.zeros(()))) > SMALLEST_JUMP
 
 
 def _left_out(rows: ArcRows, short: list[int], end: int) -> Iterator[tuple[ArcRows, int, float]]:

@@ -38,8 +38,8 @@ NEEDED_ROUNDING = 1e-13
 SAFE, LAST_NEWTON_STEPS = 1 / 32, 4
 #: Steps of a search; where they do not reach the end, the rest is asked for again.
 MOST_PARABOLAS = 64
-#: The bend of a straight line.
-NO_BEND = 1e-300
+#: What may be zero is divided by this, at least.
+LEAST_DIVISOR = 1e-300
 
 
 class FirstEnd(NamedTuple):
@@ -75,7 +75,7 @@ def hold_from(osc: Oscillator, mode: Mode, asked: Array, x1, x2, t, remaining) -
     n, now = len(osc.belts), at_time(osc, t)
     waves = [_wave(osc, one, t) for one in osc.forcing if not isinstance(one, ConstantForce)]
     limit, zero = capacity(now, mode), jnp.zeros_like(x1)
-    bend = sum((jnp.abs(a) * w * w for a, w, _ in waves), zero + NO_BEND)
+    bend = sum((jnp.abs(a) * w * w for a, w, _ in waves), zero + LEAST_DIVISOR)
     fuzz = NEEDED_ROUNDING * blur(t) * (1 + limit + jnp.abs(x1))
     rest = mode_acceleration(now, mode, x1, x2)
     rest = rest - sum((a * cosine_and_sine(theta)[0] for a, _, theta in waves), zero)
@@ -135,7 +135,7 @@ def hold_from(osc: Oscillator, mode: Mode, asked: Array, x1, x2, t, remaining) -
         way = jnp.where(ends, -value / jnp.where(ends, slope, 1.0), 0.0)
         tau = jnp.maximum(tau + way, 0.0)
     # Where a limit and an edge are at one place but for rounding, what is beyond the edge decides.
-    rounding = fuzz / jnp.maximum(jnp.abs(x2), NO_BEND)
+    rounding = fuzz / jnp.maximum(jnp.abs(x2), LEAST_DIVISOR)
     at_edge = ~going & (to_edge <= remaining) & (~ends | (to_edge <= tau + rounding))
     at_limit = ends & ~at_edge & (tau <= remaining)
     number = jnp.where(at_limit, jnp.where(side < 0, 3 * n, 3 * n + 1), -1)
