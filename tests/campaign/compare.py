@@ -34,6 +34,8 @@ ENGINE_GAVE_UP = (engine.BUDGET, engine.CORNER, engine.STEPS)
 #: for less of the run.
 MANY_EVENTS, MANY_STEPS, ENOUGH = 2_000_000, 20_000_000, 50_000
 GOOD = ("same", "tolerance", "corner")
+#: Differences that a run has to its own tolerance where it passes some ten thousand events.
+UNSURE = ("state", "sequence", "more events", "fewer events")
 
 
 def run(case, **options):
@@ -231,7 +233,7 @@ def judge(case, told, tol, again=None):
                     return "tolerance", mine
     if grazing and _between(case, told, mine, tol):
         return "tolerance", mine
-    if what == "state" and not grazing and _among(told, others, mine):
+    if what in UNSURE and not grazing and _among(told, others, mine):
         return "tolerance", mine
     if not grazing and (mine.margin <= CORNER or mine.status == engine.CORNER):
         if told.status in ORDINARY and _rests_unstably(case):
@@ -250,11 +252,15 @@ def judge(case, told, tol, again=None):
 
 
 def _among(told, others, mine):
-    """Whether a state is one of the disturbed runs', none of which has the sequence of the run.
+    """Whether a state and its number of events are among those of the disturbed runs, none of which
+    has the sequence of the run.
 
-    A run of some ten thousand events has its sequence to no tolerance.
+    A run of some ten thousand events has its sequence to no tolerance, nor their number.
     """
     if any(run.sequence == mine.sequence for run in others):
+        return False
+    numbers = [len(run.kind) for run in (mine, *others)]
+    if not min(numbers) <= told.n_events <= max(numbers):
         return False
     room = max(np.max(np.abs(np.array(run.y_end) - mine.y_end)) for run in others)
     return bool(np.max(np.abs(np.array([told.x1, told.x2]) - mine.y_end)) <= room)
