@@ -28,7 +28,7 @@ CAMPAIGNS = {
         name: name
         for name in (
             *("paths", "refine", "portraits", "shocks", "fractions", "maps", "steep"),
-            *("coverage", "slopes", "branches"),
+            *("coverage", "slopes", "branches", "curves", "designs"),
         )
     },
     "forced-sweep": "forced_sweeps",
@@ -40,7 +40,7 @@ RUNS = PLAIN | {"threads", "extreme_share", "heavy", "regime", "structure", "tol
 KNOWN = {
     **dict.fromkeys(("paths", "refine", "portraits", "shocks"), PLAIN),
     "maps": frozenset(),
-    **dict.fromkeys(("steep", "coverage", "slopes", "branches"), PLAIN),
+    **dict.fromkeys(("steep", "coverage", "slopes", "branches", "curves", "designs"), PLAIN),
     "fractions": PLAIN | {"threads"},
     "forced-sweep": PLAIN | {"threads", "structure", "tol"},
     "forced": PLAIN | {"threads", "structure", "tol"},

@@ -5,7 +5,8 @@ cell; curves that bound nothing, that is, beside no row of which motions differ;
 without a name; rows, and special points on the way, with a residual that is not small; and rows of
 which the mirror image is no point of the mirrored oscillator: x1 to -x1 exchanges (nu0, nu1) with
 (-nu1, -nu0) and (sigma0, sigma1) with (-sigma1, -sigma0), where both belts are alike. Special
-points of a map that is its own mirror image have theirs among them.
+points of a map that is its own mirror image have theirs among them. And in cells drawn at random
+the engine has to have the equilibria and the cycles that the name of the region tells of.
 """
 
 import time
@@ -16,12 +17,15 @@ from dataclasses import dataclass
 import numpy as np
 
 import jaxbelt as jb
+from jaxbelt.bifurcations import cells
 from jaxbelt.bifurcations.bounds import Bounds, neighbours_that_differ
 from jaxbelt.bifurcations.cells import motions_in_cells
+from jaxbelt.bifurcations.labels import Label
 from jaxbelt.bifurcations.regions import varied_by_names
 from jaxbelt.model.own_units import in_own_units
 from jaxbelt.numerics.continuation import Stop
 
+from . import package, paths
 from .outcome import Outcome
 
 #: Cells along the axes: other numbers, lest cells lie where both parameters are the same.
@@ -32,6 +36,8 @@ ROWS, BESIDE = 7, 2e-3
 SMALL, SAME = 1e-8, 1e-9
 #: The same of special points in which a curve ends, where it may be extrapolated.
 END = 1e-2
+#: Cells that the engine is asked about, and its starts in each.
+ASKED, STARTS = 150, 24
 #: How far from a row, at most, its image is looked for.
 ASIDE = 1e-4
 
@@ -90,6 +96,7 @@ def differences(plane: Plane, told: jb.RegionMap) -> tuple[Counter, list[str]]:
         wrong += _not_mirrored(plane, curve, counts)
         wrong += _not_solved(curve)
     wrong += _without_image(plane, told)
+    wrong += _not_the_engines(plane, told, counts)
     return counts, wrong
 
 
@@ -102,8 +109,8 @@ def _boundaries(plane: Plane, told: jb.RegionMap) -> np.ndarray:
     """Pairs of neighbouring cells that differ, as `bounds.neighbours_that_differ` has them."""
     grid = np.meshgrid(*told.values, indexing="ij")
     points = np.column_stack([axis.ravel() for axis in grid])
-    cells = motions_in_cells(in_one_unit(plane.make), told.names, points)
-    return neighbours_that_differ(cells.motions.reshape(grid[0].shape), told.on_line)
+    found = motions_in_cells(in_one_unit(plane.make), told.names, points)
+    return neighbours_that_differ(found.motions.reshape(grid[0].shape), told.on_line)
 
 
 def _some_rows(curve: jb.BifurcationCurve) -> list[int]:
@@ -155,6 +162,30 @@ def _not_solved(curve: jb.BifurcationCurve) -> list[str]:
         for point in curve.special
         if not point.residual < (END if any(point is end for end in ends) else SMALL)
     ]
+
+
+def _not_the_engines(plane: Plane, told: jb.RegionMap, counts: Counter) -> list[str]:
+    """Cells whose region has other equilibria or cycles than the engine sees there."""
+    rng, wrong = np.random.default_rng(len(told.curves)), []
+    for cell in rng.integers(told.label.size, size=ASKED).tolist():
+        place = np.unravel_index(cell, told.label.shape)
+        at = [float(along[i]) for along, i in zip(told.values, place)]
+        osc = package.engines(plane.make(**dict(zip(told.names, at, strict=True))))
+        starts = np.column_stack([rng.uniform(-3, 3, STARTS), rng.uniform(-1.5, 1.5, STARTS)])
+        seen = paths.label_of(osc, list(map(tuple, starts)))
+        if not seen.decided or told.on_line[place]:
+            counts["cells undecided"] += 1
+            continue
+        counts["cells"] += 1
+        name = cells.region_name(plane.make(*at), as_label(seen))
+        if name != told.label[place]:
+            wrong.append(f"at {at} {told.label[place]}, the engine {name}: {paths.words(seen)}")
+    return wrong
+
+
+def as_label(seen: paths.Label) -> Label:
+    """The engine's label as the package's."""
+    return Label(seen.rests, tuple(sorted(cycle.modes for cycle in seen.cycles)))
 
 
 def _without_image(plane: Plane, told: jb.RegionMap) -> list[str]:

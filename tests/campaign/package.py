@@ -63,6 +63,17 @@ def oscillator(osc):
     return jb.Oscillator(osc.damping, belts, osc.omega)
 
 
+def engines(osc):
+    """An oscillator of the package's, whose laws are Conti's, as the engine's."""
+    names = ("static", "residual", "steepness", "quadratic")
+    belts = []
+    for b in osc.belts:
+        law = ("conti", *(float(getattr(b.friction, name)) for name in names))
+        ends = float(b.lower), float(b.upper)
+        belts.append(engine.Belt(float(b.velocity), law, float(b.load), *ends))
+    return engine.Oscillator(float(osc.damping), tuple(belts), float(osc.omega))
+
+
 def as_code(case):
     """The case as an expression for a notebook."""
     osc, y0 = case.given

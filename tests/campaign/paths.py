@@ -78,7 +78,7 @@ class Case:
 
     def at(self, value: float) -> engine.Oscillator:
         """The engine's oscillator there."""
-        return _with(self.oscillator, self.parameter, value)
+        return with_value(self.oscillator, self.parameter, value)
 
     def given(self, value: float) -> jb.Oscillator:
         """The oscillator there as the package is given it."""
@@ -98,11 +98,11 @@ class Case:
     @property
     def where(self):
         """The function that selects the parameter of the package's oscillator."""
-        return _selector(self.parameter)
+        return selector(self.parameter)
 
 
 @functools.cache
-def _selector(parameter: tuple[int, str]):
+def selector(parameter: tuple[int, str]):
     """One function a parameter, so that what is compiled for it serves all paths."""
     number, name = parameter
 
@@ -117,7 +117,21 @@ def _selector(parameter: tuple[int, str]):
     return where
 
 
-def _with(osc: engine.Oscillator, parameter: tuple[int, str], value: float) -> engine.Oscillator:
+def value_of(osc: engine.Oscillator, parameter: tuple[int, str]) -> float:
+    """The value of a parameter, (belt or -1, name)."""
+    number, name = parameter
+    if number < 0:
+        return getattr(osc, name)
+    belt = osc.belts[number]
+    if name.startswith("law "):
+        return belt.law[1 + NUMBERS[belt.law[0]].index(name.removeprefix("law "))]
+    return getattr(belt, name)
+
+
+def with_value(
+    osc: engine.Oscillator, parameter: tuple[int, str], value: float
+) -> engine.Oscillator:
+    """The oscillator with another value of a parameter."""
     number, name = parameter
     if number < 0:
         return replace(osc, **{name: value})
@@ -142,7 +156,6 @@ def random_path(rng: np.random.Generator, structure, *, rational: bool) -> Case:
             parameter, value = (-1, "damping"), osc.damping
         else:
             belt = osc.belts[number]
-            law = NUMBERS[belt.law[0]]
             name = str(rng.choice(["velocity", "velocity", "velocity", "load", "edge", "law"]))
             ends = [end for end in ("lower", "upper") if isfinite(getattr(belt, end))]
             if name == "edge" and not ends:
@@ -151,10 +164,9 @@ def random_path(rng: np.random.Generator, structure, *, rational: bool) -> Case:
                 name = str(rng.choice(ends))
             if name == "law":
                 place = int(rng.integers(len(belt.law) - 1))
-                name, value = f"law {law[place]}", belt.law[1 + place]
-            else:
-                value = getattr(belt, name)
+                name = f"law {NUMBERS[belt.law[0]][place]}"
             parameter = number, name
+            value = value_of(osc, parameter)
         width = rng.uniform(0.1, 0.8) * (
             1.0 if parameter[1] in ("velocity", "lower", "upper") else max(abs(value), 0.1)
         )
@@ -162,7 +174,7 @@ def random_path(rng: np.random.Generator, structure, *, rational: bool) -> Case:
         span = first, first + width
         if rational:
             span = tuple(round(20 * end) / 20 for end in span)
-        if span[0] < span[1] and all(is_possible(_with(osc, parameter, end)) for end in span):
+        if span[0] < span[1] and all(is_possible(with_value(osc, parameter, end)) for end in span):
             return Case(osc, parameter, span, "rational" if rational else "random")
 
 
@@ -535,7 +547,7 @@ def check(case: Case, seed: int) -> Report:
                 sides = [brute.labels[at] for at in (low, high)]
                 if sides[0].name == sides[1].name:
                     continue
-                names = [_words(side) for side in sides]
+                names = [words(side) for side in sides]
                 report.wrong.append(f"change at {low:.9g}..{high:.9g}: {names[0]} | {names[1]}")
             report.changes += 1
     report.undecided = sum(not label.decided for label in brute.labels.values())
@@ -560,7 +572,7 @@ def _compare(path: OwnPath, brute: Brute, value: float, report: Report) -> None:
         ):
             report.wrong.append(f"at {value:.12g} scan has {modes} {place.round(6)}: {cycle}")
     if tuple(sorted(cycle.modes for cycle in label.cycles)) != ours.cycles:
-        report.wrong.append(f"at {value:.12g} cycles {ours.cycles}, engine {_words(label)}")
+        report.wrong.append(f"at {value:.12g} cycles {ours.cycles}, engine {words(label)}")
     if label.rests != ours.equilibria:
         report.wrong.append(f"at {value:.12g} rests {ours.equilibria}, engine {label.rests}")
 
@@ -595,7 +607,7 @@ def _both_sides(path: OwnPath, point, special, brute: Brute, report: Report) -> 
             for cycle in jb.portrait(brute.case.given(value)).cycles:
                 brute.learn(value, (float(cycle.x1_max) / brute.case.units.length, 0.0))
     if all(side.decided for side in sides) and sides[0].name == sides[1].name:
-        report.wrong.append(f"nothing changes at {point!r}: {_words(sides[0])}")
+        report.wrong.append(f"nothing changes at {point!r}: {words(sides[0])}")
 
 
 def _part(case: Case, orbit: np.ndarray, period: float, at: float, away: float) -> bool:
@@ -624,7 +636,7 @@ def _start_on(loop, length: float) -> tuple[float, float]:
     return x1, x2
 
 
-def _words(label: Label) -> str:
+def words(label: Label) -> str:
     cycles = [(cycle.modes, cycle.place.round(6).tolist()) for cycle in label.cycles]
     return f"rests {label.rests} cycles {cycles}"
 

@@ -1,0 +1,94 @@
+"""Curves in two parameters, against the engine's labels on both sides of their rows.
+
+Along random paths, those of the campaign `paths`, `scan` finds points. One of them is followed in
+the parameter of the path and a second one, drawn at random. On both sides of some of its rows,
+along the parameter across which the curve runs, the engine has other labels; it starts from many
+states, from the cycle that a row tells of, and from all that `portrait` finds beside.
+"""
+
+import jax
+import numpy as np
+
+import jaxbelt as jb
+
+from . import package, paths
+from .outcome import Outcome
+
+#: Rows that are asked of a curve, and how far from a row both sides are, in units of the spans.
+ROWS, BESIDE = 5, 2e-3
+#: Width of the span of the second parameter: of its size, and at least.
+WIDTH, LEAST = 0.3, 0.1
+#: Points of kinds at which no attractor and no equilibrium changes.
+SILENT = frozenset({"HopfAtInfinity", "SaddleConnection"})
+#: After so many paths compiled programs are dropped: a thousand of them fill the memory.
+TOGETHER = 10
+
+
+def outcome(options, number: int) -> Outcome:
+    """Follow one point and look at both sides of some rows."""
+    case = paths.case_of(options.seed, number)
+    if number % TOGETHER == 0:
+        jax.clear_caches()
+    rng = np.random.default_rng((options.seed, number, 2))
+    osc = package.oscillator(case.at(0.5 * sum(case.span)))
+    points = [p for p in jb.scan(osc, case.where, case.span) if p.status == jb.Status.OK]
+    points = [p for p in points if p.kind not in SILENT]
+    one = Outcome(f"{case.parameter}, {len(points)} points")
+    if not points:
+        return one
+    point = points[rng.integers(len(points))]
+    other, span = _second(case, rng)
+    curve = jb.bifurcation_curve(point, (case.where, paths.selector(other)), (case.span, span))
+    one.line += f", {other}: {curve!r}"
+    one.counts["curves"] += 1
+    for row in sorted({int(row) for row in np.linspace(0, len(curve) - 1, ROWS + 2)[1:-1]}):
+        verdict, sides = _beside(case, other, curve, row, np.array([case.span, span]), rng)
+        one.counts[verdict] += 1
+        if verdict == "nothing changes":
+            said = f"{verdict} at row {row}, {curve.values[row].tolist()}, of {curve!r}: {sides}"
+            one.wrong.append(f"{said}\n    {case.oscillator!r}, {case.parameter}, {other}")
+    return one
+
+
+def _second(case: paths.Case, rng) -> tuple[tuple[int, str], tuple[float, float]]:
+    """Another parameter, and a span of it around its value."""
+    osc = case.oscillator
+    belts = range(len(osc.belts))
+    able = [(-1, "damping"), *((i, name) for i in belts for name in ("velocity", "load"))]
+    able = [parameter for parameter in able if parameter != case.parameter]
+    while True:
+        parameter = able[rng.integers(len(able))]
+        value = paths.value_of(osc, parameter)
+        half = 0.5 * WIDTH * max(abs(value), LEAST)
+        ends = value - half, value + half
+        if all(paths.is_possible(paths.with_value(osc, parameter, end)) for end in ends):
+            return parameter, ends
+
+
+def _beside(case, other, curve, row, spans, rng):
+    """Whether labels differ on the two sides of a row, and the labels."""
+    sizes = spans[:, 1] - spans[:, 0]
+    near = curve.values[[max(row - 1, 0), min(row + 1, len(curve) - 1)]]
+    across = int(np.argmin(np.abs(near[1] - near[0]) / sizes))
+    values = curve.values[row]
+    held = ((other, values[1]), (case.parameter, values[0]))[across]
+    free = (case.parameter, other)[across]
+    middle = paths.with_value(case.oscillator, held[0], float(held[1]))
+    line = paths.Case(middle, free, tuple(spans[across].tolist()), case.kind)
+    away = BESIDE * sizes[across]
+    brute = paths.Brute(line, rng)
+    ends = float(values[across] - away), float(values[across] + away)
+    starts = [(float(x), 0.0) for x in curve.places[row, :2] if np.isfinite(x)]
+    if not all(paths.is_possible(line.at(end)) for end in ends):
+        return "at the rim", ""
+    sides = [brute.look(end, starts) for end in ends]
+    for end in ends:
+        for cycle in jb.portrait(line.given(end)).cycles:
+            brute.learn(end, (float(cycle.x1_max), 0.0))
+    for label, end in ((sides[0], ends[1]), (sides[1], ends[0])):
+        for cycle in list(label.cycles):
+            brute.learn(end, cycle.state)
+    if not all(side.decided for side in sides):
+        return "undecided", ""
+    changes = sides[0].name != sides[1].name
+    return ("changes" if changes else "nothing changes"), paths.words(sides[0])
