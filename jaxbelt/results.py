@@ -38,7 +38,7 @@ class Status(enum.IntEnum):
     NOT_IDENTIFIED = 16  #: the record does not determine all parameters
     MISFIT = 17  #: the best fit leaves more than noise
     # Targets: `design`.
-    UNREACHABLE = 18  #: the targets cannot be reached within the bounds
+    UNREACHABLE = 18  #: the targets were not reached within the bounds
     # Bifurcation points.
     NO_FOLD = 19  #: no two cycles meet nearby
     # Portraits, and shocks in them.

@@ -624,6 +624,20 @@ def test_exponents_of_chaos(frequency, start, wanted):
 # --- what is refused ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(first=True)
+def test_a_stable_motion_is_not_what_every_slow_orbit_leads_to():
+    """Hardly damped, the free motion dies away slowly beside the response, whose frequency is near
+    to it. From 0.5 it does not touch the velocity of the belt; from 1.1 the two add up to it after
+    150 periods, and the mass sticks and slips from then on."""
+    belt = jb.Belt(1.0, jb.Coulomb(1.5, 0.5))
+    osc = jb.Oscillator(1e-4, (belt,), forcing=jb.Harmonic(0.0012, 1.002))
+    motion = jb.find_cycle(osc, (0.5, 0.0))
+    assert int(motion.status) == jb.Status.OK and not motion.signature
+    run = jb.simulate(osc, (1.1, 0.0), 1000.0)
+    assert float(run.events.t[0]) == pytest.approx(953.7, abs=0.1)
+    assert int(jb.find_cycle(osc, (1.1, 0.0)).status) == jb.Status.NOT_SETTLED
+
+
 def test_what_is_for_forced_oscillators_says_so():
     still = jb.presets.class_b(0.45, 0.35)
     with pytest.raises(ValueError, match="osc must be with a clock: periodic is for"):

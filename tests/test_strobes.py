@@ -343,3 +343,42 @@ def test_an_exponent_needs_an_end_and_labels_no_audit():
         jb.sweep(bernardo, {"frequency": [1.7]}, observe="attractor", audit=0.5)
     with pytest.raises(ValueError, match="t0 must be"):
         jb.basins(jb.presets.class_b(0.3, 0.35), x1=[0.0], x2=[0.0], t0=1.0)
+
+
+@pytest.mark.slow(first=True)
+def test_what_has_not_settled_is_no_attractor():
+    """A linear response that has not died away, one that grows beyond all bounds, with negative
+    damping or at resonance, and a motion that leaves an unstable one, slowly."""
+
+    def make(damping, amplitude, frequency, velocity, load, residual):
+        belt = jb.Belt(velocity, jb.Conti(1.0, residual, 1.0), load)
+        forcing = jb.Harmonic(amplitude, frequency)
+        return jb.Oscillator(damping, (belt,), forcing=forcing)
+
+    names = "damping", "amplitude", "frequency", "velocity", "load", "residual", "x1"
+    rows = (
+        (2e-5, 0.3, 2.0, 2.0, 1.0, 1.0, 1.5),
+        (2e-5, 0.3, np.sqrt(2), 2.0, 1.0, 1.0, 1.5),
+        (1e-6, 0.3, 2.0, 2.0, 1.0, 1.0, 1.5),
+        (-0.001, 0.1, np.sqrt(2), 100.0, 1.0, 1.0, 1.0),
+        (0.0, 1.0, 1.0, 0.0, 0.4, 1.0, 0.0),
+        (0.0, 1.0, 1.0, 0.0, 0.75, 1.0, 1.0),
+        (0.0998, 0.001, 1.5, 1.0, 1.0, 0.6, 0.8),
+    )
+    for row in rows:
+        axes = {name: [value] for name, value in zip(names, row, strict=True)}
+        found = jb.sweep(make, axes, y0=(0.8, 0.0), t1=3000.0, observe="attractor").squeeze()
+        assert jb.decoded(found).kind == "undecided", row
+        assert found.status == Status.NOT_SETTLED, row
+
+
+@pytest.mark.slow(first=True)
+def test_a_mass_that_swings_with_a_belt_wherever_it_stuck_to_it_has_no_attractor():
+    """It slips once, and sticks from then on: each place to stick is as good as the next."""
+
+    def make(amplitude):
+        belt = jb.Belt(jb.Oscillating(0.0, amplitude, 1.0), jb.Coulomb(1.0, 1.0))
+        return jb.Oscillator(0.1, (belt,))
+
+    found = jb.sweep(make, {"amplitude": [0.1, 0.2]}, y0=(0.2, 0.5), t1=2000.0, observe="attractor")
+    assert np.all(found.status == Status.NEUTRAL) and np.all(found.n_events == 1)

@@ -180,8 +180,9 @@ def design(
     """Parameters for which functionals of the cycle have given values.
 
     The method is Newton's, damped, with exact derivatives; with fewer targets than parameters it
-    takes the shortest steps. The status is UNREACHABLE where no choice within the bounds meets the
-    targets, and where they lie behind a bifurcation at which the cycle vanishes.
+    takes the shortest steps. The status is UNREACHABLE where no choice within the bounds that these
+    steps come to meets the targets: the nearest may be best only among those beside it, and targets
+    may lie behind a bifurcation at which the cycle vanishes. Then begin with another oscillator.
 
     Of a forced oscillator the cycle is the stable `PeriodicMotion` that y0 leads to. It is
     followed: each trial begins from the motion of the last one that was accepted. A trial that

@@ -78,6 +78,8 @@ GUARD_DOUBT = 1e-15
 SHORT_TIMED_STEP = 1e-3
 #: No step is asked twice below this one, over the time that a Taylor step bridges.
 SHORTEST_TIMED_STEP = 1e-4
+#: A step that would be shortened to more than this share of itself is halved.
+NO_SHORTER = 0.99
 #: Of the highest coefficient of what is needed, how far the polynomial may be off.
 LAST_TERM = 1e-4
 #: Error of the time of slip onset that needs no shorter step, over `LANDS_WITHIN` of the tolerance.
@@ -467,10 +469,12 @@ def take_timed_step(
     theta, cuts = jnp.ones_like(h), no
     for one in found:
         blocks = one.cut | (one.once & (one.delta >= NEVER))
-        sooner = blocks & (one.there < theta)
-        theta, cuts = jnp.where(sooner, one.there, theta), cuts | blocks
+        # What is shortened has to be shorter, also where rounding has its root at the end.
+        there = jnp.where(one.there > NO_SHORTER, 0.5, one.there)
+        sooner = blocks & (there < theta)
+        theta, cuts = jnp.where(sooner, there, theta), cuts | blocks
         # What stands on a guard at once lands on it.
-        number = jnp.where(sooner & (one.there * h < NO_STEP), one.number, number)
+        number = jnp.where(sooner & (there * h < NO_STEP), one.number, number)
     blocked = cuts
 
     last = h >= remaining

@@ -49,8 +49,9 @@ from .strobes import Growth, course_of_step, delay_of_event, grown, grown_past
 if TYPE_CHECKING:
     import pandas
 
-#: Parts into which an interval with a fixed point is cut, and how often: to 1e-6 of itself.
-PARTS_OF_INTERVAL, CUTS = 32, 4
+#: Parts into which an interval is cut in which the map changes much; and one with a fixed point,
+#: and how often: to 1e-6 of itself.
+PARTS_OF_INTERVAL, PARTS_OF_CUT, CUTS = 32, 4, 10
 #: Where the periods to the next onset differ by more from one phase to the next, or one of the two
 #: leads nowhere, fixed points are searched between finer phases.
 ROUGH = 0.02
@@ -438,16 +439,17 @@ class _Mapping:
         rough = np.any(known, axis=1) & ~(np.abs(np.ptp(ends[1], axis=1)) <= ROUGH)
         parts = (
             _crossings(*(one[~rough] for one in ends)),
-            _crossings(*self._between(*ends[0][rough].T)),
+            _crossings(*self._between(ends[0][rough], ends[1][rough], PARTS_OF_INTERVAL)),
         )
-        lows, highs, counts, first, _ = (np.concatenate(both) for both in zip(*parts))
-        rises = first
+        places, values, counts, _ = (np.concatenate(both) for both in zip(*parts))
+        first = np.abs(np.diff(values))[:, 0]
         for _ in range(CUTS):
-            inner = self._between(lows, highs)
-            lows, highs, counts, rises, rows = _crossings(*inner, counts)
+            inner = self._between(places, values, PARTS_OF_CUT)
+            places, values, counts, rows = _crossings(*inner, counts)
             first = first[rows]
-        for low, high, count, goes_on in zip(lows, highs, counts, rises < STILL_RISES * first):
-            if not goes_on:
+        goes_on = np.abs(np.diff(values))[:, 0] < STILL_RISES * first
+        for (low, high), count, is_point in zip(places, counts, goes_on):
+            if not is_point:
                 continue
             motion, onsets = self._motion(0.5 * (low + high), int(count))
             off = (onsets - low + SAME_PHASE) % (2 * np.pi)
@@ -460,11 +462,18 @@ class _Mapping:
         places = np.array([place for place, _ in found])
         return places, [motion for _, motion in found], np.array(unsolved)
 
-    def _between(self, lows: np.ndarray, highs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Phases from low to high ones, and periods from them to the next onsets, [rows, k]."""
-        shares = np.arange(PARTS_OF_INTERVAL + 1) / PARTS_OF_INTERVAL
-        inner = lows[:, None] + (highs - lows)[:, None] * shares
-        return inner, self.of_phases(inner.ravel())["turns"].reshape(inner.shape)
+    def _between(
+        self, ends: np.ndarray, values: np.ndarray, parts: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Phases from low to high ones, and periods from them to the next onsets.
+
+        ends, values: the same of the low and the high ones, [rows, 2]. Both have the shape
+        [rows, parts + 1].
+        """
+        shares = np.arange(parts + 1) / parts
+        places = ends[:, :1] + (ends[:, 1:] - ends[:, :1]) * shares
+        inner = self.of_phases(places[:, 1:-1].ravel())["turns"].reshape(-1, parts - 1)
+        return places, np.concatenate([values[:, :1], inner, values[:, 1:]], axis=1)
 
     def _motion(self, phase: float, periods: int) -> tuple[PeriodicMotion | None, np.ndarray]:
         """The motion that repeats after so many periods near an onset at a phase, and the phases of
@@ -490,13 +499,15 @@ class _Mapping:
 
 def _crossings(phases: np.ndarray, turns: np.ndarray, counts: Any = None) -> list[np.ndarray]:
     """The intervals between phases, [rows, k], in which the time to the next onset passes a whole
-    number of periods: lower and upper ends, these numbers, rises, and rows. counts: the numbers
-    that are asked for, [rows]; None: all."""
+    number of periods: both ends, the times there, these numbers, and rows. counts: the numbers that
+    are asked for, [rows]; None: all."""
     before, after = turns[:, :-1], turns[:, 1:]
     known, found = np.isfinite(before) & np.isfinite(after), []
     for m in range(1, PERIODS_AT_ONCE + 1):
         passes = known & ((before >= m) != (after >= m))
         rows, i = np.nonzero(passes if counts is None else passes & (counts == m)[:, None])
-        rise = np.abs(after - before)[rows, i]
-        found.append((phases[rows, i], phases[rows, i + 1], np.full(len(rows), m), rise, rows))
+        ends, values = (
+            np.stack([one[rows, i], one[rows, i + 1]], axis=1) for one in (phases, turns)
+        )
+        found.append((ends, values, np.full(len(rows), m), rows))
     return [np.concatenate(parts) for parts in zip(*found, strict=True)]

@@ -69,9 +69,17 @@ FIRST_PATIENCE = 8
 UNMEASURED = 0.25
 #: Standard errors within which an exponent is zero; per period the error of its computation, and
 #: how large both may be together where a motion is quasiperiodic.
-DEVIATIONS, COMPUTED, RESOLVED = 3.0, 1e-4, 0.01
+DEVIATIONS, COMPUTED, RESOLVED = 3.0, 1e-12, 0.01
+#: By so much of its size the largest displacement of a quasiperiodic motion, and of a chaotic one,
+#: may differ in two halves of a run; what differs by more has not settled, or grows without bound.
+STEADY, STEADY_CHAOS = 0.01, 0.2
+#: The logarithm of how much a tangent grows, at least, while the exponent of chaos is measured: a
+#: motion that grew as much would be seen to grow.
+GROWTH_OF_CHAOS = 10.0
 #: Growth of a tangent, its logarithm, that is rounding.
 STILL = 1e-9
+#: Shares of the time that the mass does not stick, and differences of states, that are rounding.
+CARRIED, ROUNDING = 1e-9, 1e-13
 #: An extremum is known from a point that is this near in time; steps are cut until there is one.
 NEAR_EXTREMUM = 1e-3
 
@@ -81,8 +89,8 @@ class _Repeats(eqx.Module):
 
     x1, x2: the state that later ones are compared with, of the strobe `at`; patience: strobes until
     it is given up; n: strobes after which the motion seems to repeat, 0: not yet; confirmed:
-    strobes over which it has; moved: how far the last repeat was from its own; nearest: the
-    smallest distance of another strobe.
+    strobes over which it has; log: of the tangent's growth when these began; moved: how far the
+    last repeat was from its own; nearest: the smallest distance of another strobe.
     """
 
     x1: Array
@@ -91,6 +99,7 @@ class _Repeats(eqx.Module):
     patience: Array
     n: Array
     confirmed: Array
+    log: Array
     moved: Array
     nearest: Array
 
@@ -158,9 +167,9 @@ class Growth(eqx.Module):
         )
 
     @property
-    def is_still(self) -> Array:
-        """Whether the tangent has kept its size to rounding: the motion attracts nothing."""
-        return jnp.abs(self.log) < STILL
+    def size(self) -> Array:
+        """The logarithm of the tangent's growth until now; -inf where it has vanished."""
+        return self.log + jnp.log(jnp.hypot(self.d1, self.d2))
 
     def exponent(self) -> tuple[Array, Array]:
         """The largest exponent per unit of time, and its standard error; NaN without blocks."""
@@ -176,14 +185,16 @@ class _RunSoFar(eqx.Module):
     """Memory of the observers, arrays [lanes].
 
     strobes: number of the next strobe, counted from t = 0; turns: of the first force from one to
-    the next, 0: the frequencies have no period in common. kind, periods, loop_events: of the
-    attractor, once known; transient: the time when it was.
+    the next, 0: the frequencies have no period in common. farthest: largest distance from the
+    origin in each half of the time in which exponents are measured. kind, periods, loop_events: of
+    the attractor, once known; transient: the time when it was.
     """
 
     strobes: Array
     turns: Array
     repeats: _Repeats
     extent: _Extent
+    farthest: tuple[Array, Array]
     growth: Growth
     kind: Array
     periods: Array
@@ -229,13 +240,13 @@ class ForcedAttractor(Observer):
     - A periodic motion: its states at strobes repeat, all of them, over `CONFIRMED` strobes and two
       of its periods; no state in between is the same; and what is left of the approach, by the rate
       at which it shrinks, is below `SAME` of its size.
-    - None of these: one of a continuum of motions, where nothing makes a tangent grow or shrink. It
-      attracts nothing, and the run ends undecided with the status NEUTRAL.
+    - None of these: one of a continuum of motions, where a tangent keeps its size while the motion
+      repeats, or always. It attracts nothing, and the run ends undecided with the status NEUTRAL.
     - Stuck for ever, or at rest on an edge that pushes back from both sides at all times.
     - Where no repeat is found until the end of the run its largest exponent decides: it is chaotic
       where that is more than three standard errors above zero, quasiperiodic where it is zero
       within these, the mass never sticks and nothing seems to repeat, and else undecided, with the
-      status NOT_SETTLED.
+      status NOT_SETTLED; so is a motion that still grows or shrinks.
     """
 
     variables: ClassVar[Mapping[str, Variable]] = {
@@ -259,12 +270,14 @@ class ForcedAttractor(Observer):
         passed = jnp.floor(lanes.t / _strobe_period(osc, turns) * (1 + 1e-14) + 1e-12)
         nowhere, never = zero + jnp.nan, jnp.full_like(count, -1)
         patience = count + FIRST_PATIENCE
-        repeats = _Repeats(nowhere, nowhere, never, patience, count, count, zero, zero + jnp.inf)
+        far = zero + jnp.inf
+        repeats = _Repeats(nowhere, nowhere, never, patience, count, count, zero, zero, far)
         return _RunSoFar(
             strobes=(passed + 1).astype(count.dtype),
             turns=turns,
             repeats=repeats,
             extent=_Extent.none(lanes, len(osc.belts)),
+            farthest=(zero, zero),
             growth=Growth.none(lanes),
             kind=count,
             periods=count,
@@ -289,8 +302,17 @@ class ForcedAttractor(Observer):
         going_on = seen.kind == UNDECIDED
         extent = self._extended(seen.extent, lanes, new, course)
         seen = replace(seen, growth=growth, extent=choose(going_on & ~cut, extent, seen.extent))
+        share = (new.t - growth.began) / (t1 - growth.began)
+        second = share >= 0.5 * (1 + UNMEASURED)
+        halves = (share >= UNMEASURED) & ~second, second
+        distance = jnp.hypot(new.x1, new.x2)
+        farthest = tuple(
+            jnp.where(inside, jnp.maximum(far, distance), far)
+            for far, inside in zip(seen.farthest, halves, strict=True)
+        )
+        seen = replace(seen, farthest=farthest)
         due = (h > 0) & (new.t >= strobe) & (seen.turns > 0) & going_on
-        return replace(new, memory=self._strobed(seen, new, due, rtol))
+        return replace(new, memory=self._strobed(osc, seen, new, due, rtol))
 
     def _extended(self, extent: _Extent, lanes: Lanes, new: Lanes, course: Course) -> _Extent:
         """The extent with a step: with both of its ends, and with extrema near to one of them."""
@@ -331,7 +353,9 @@ class ForcedAttractor(Observer):
 
     # --- strobes
 
-    def _strobed(self, seen: _RunSoFar, lanes: Lanes, due: Array, tol: Array) -> _RunSoFar:
+    def _strobed(
+        self, osc: OwnOscillator, seen: _RunSoFar, lanes: Lanes, due: Array, tol: Array
+    ) -> _RunSoFar:
         """The memory behind a strobe, where one is due."""
         now, known = seen.strobes, seen.repeats
         extent, x1, x2 = seen.extent, lanes.x1, lanes.x2
@@ -362,6 +386,15 @@ class ForcedAttractor(Observer):
         still = jnp.where(away <= errors, 0.0, APART * left)
         alone = (known.n == 1) | (nearest > still + APART_OF_ERRORS * errors)
         found = again & settled & alone & (confirmed >= jnp.maximum(CONFIRMED, 2 * known.n))
+        # A mass that a belt carries is where it was if nothing but rounding says otherwise.
+        elapsed = since.astype(x1.dtype) * _strobe_period(osc, seen.turns)
+        carried = sum(extent.sticks) >= (1 - CARRIED) * elapsed
+        found = found & (~carried | (away <= ROUNDING * (1 + jnp.abs(x1))))
+        # Nothing pulls a motion to one that lies beside others which repeat as well, and one from
+        # which a tangent leads away is no attractor.
+        gained = seen.growth.size - known.log
+        found = found & (gained < STILL)
+        kind = jnp.where(gained < -STILL, PERIODIC, FORCED_CONTINUUM)
         repeats = _Repeats(
             x1=jnp.where(fresh, x1, known.x1),
             x2=jnp.where(fresh, x2, known.x2),
@@ -369,6 +402,7 @@ class ForcedAttractor(Observer):
             patience=jnp.where(expired & (known.at >= 0), 2 * known.patience, known.patience),
             n=n.astype(known.n.dtype),
             confirmed=confirmed.astype(known.n.dtype),
+            log=jnp.where(fresh & ~again, seen.growth.size, known.log),
             moved=jnp.where(again | sooner, away, jnp.where(fresh, jnp.inf, known.moved)),
             nearest=jnp.where(fresh, jnp.inf, nearest),
         )
@@ -382,7 +416,7 @@ class ForcedAttractor(Observer):
             repeats=choose(due, repeats, known),
             extent=choose(due, kept, seen.extent),
             loop_events=jnp.where(found, lanes.events - extent.events, seen.loop_events),
-            kind=jnp.where(found, PERIODIC, seen.kind).astype(seen.kind.dtype),
+            kind=jnp.where(found, kind, seen.kind).astype(seen.kind.dtype),
             periods=jnp.where(found, known.n, seen.periods).astype(seen.periods.dtype),
             transient=jnp.where(found, lanes.t, seen.transient),
         )
@@ -395,7 +429,6 @@ class ForcedAttractor(Observer):
         resting = jnp.where(passage.captured, EQUILIBRIUM, seen.kind)
         forever = lanes.status == Status.STUCK_FOREVER.value
         kind = jnp.where(forever & (seen.kind == UNDECIDED), STUCK_FOR_EVER, resting)
-        kind = jnp.where((kind == PERIODIC) & growth.is_still, FORCED_CONTINUUM, kind)
         new = (kind != UNDECIDED) & (seen.kind == UNDECIDED)
         transient = jnp.where(new, lanes.t, seen.transient)
         memory = replace(
@@ -407,14 +440,18 @@ class ForcedAttractor(Observer):
         seen: _RunSoFar = lanes.memory
         extent, growth = seen.extent, seen.growth
         exponent, error = growth.exponent()
-        neutral = (seen.kind == FORCED_CONTINUUM) | (seen.kind == UNDECIDED) & growth.is_still
+        still = jnp.abs(growth.size) < STILL
+        neutral = (seen.kind == FORCED_CONTINUUM) | (seen.kind == UNDECIDED) & still
         open_ = (seen.kind == UNDECIDED) & (lanes.status == Status.OK.value) & ~neutral
         resolved = open_ & jnp.isfinite(exponent)
         once = _strobe_period(osc, seen.turns)
         doubt = jnp.maximum(DEVIATIONS * error, COMPUTED / once)
-        chaotic = resolved & (exponent > doubt)
+        low, high = jnp.minimum(*seen.farthest), jnp.maximum(*seen.farthest)
+        growth_seen = (1 - UNMEASURED) * (lanes.t - growth.began) * exponent
+        chaotic = resolved & (exponent > doubt) & (growth_seen >= GROWTH_OF_CHAOS)
+        chaotic = chaotic & (high - low <= STEADY_CHAOS * high)
         even = resolved & (jnp.abs(exponent) <= doubt) & (doubt * once < RESOLVED) & ~growth.sticks
-        even = even & (seen.repeats.n == 0)
+        even = even & (seen.repeats.n == 0) & (high - low <= STEADY * high)
         kind = jnp.where(chaotic, CHAOTIC, jnp.where(even, QUASIPERIODIC, seen.kind))
         kind = jnp.where(neutral, UNDECIDED, kind)
         lost = open_ & (kind == UNDECIDED)
