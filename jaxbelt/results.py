@@ -86,8 +86,9 @@ ADVICE = {
     Status.NO_CONVERGENCE: (
         "Newton's method did not converge from this guess; there may be no such solution near it, "
         "or none that this side of it leads to: try a guess on the other side. Every bifurcation "
-        "point in an interval is found by jb.scan with a span around it. A friction law of your "
-        "own has to be smooth; jb.Tabulated makes one of a table."
+        "point in an interval is found by jb.scan with a span around it; with forcing, those on a "
+        "branch by jb.bifurcation_diagram. A friction law of your own has to be smooth; "
+        "jb.Tabulated makes one of a table."
     ),
     Status.NOT_ADMISSIBLE: (
         "The solution of the equations leaves its modes (an arc passes a boundary, or ends before "
@@ -102,7 +103,7 @@ ADVICE = {
         "Nothing comes near the boundary or an edge of that belt here, so no such point is near, "
         "or the cycle ends in it and exists on its other side only (or, of a condition of your "
         "own, its equation has a value in no attracting cycle); try another belt or another value "
-        "of the parameter, or jb.scan with a span around it."
+        "of the parameter, or jb.scan with a span around it, with forcing jb.bifurcation_diagram."
     ),
     Status.OTHER_KIND: (
         "The cycle does touch the boundary at a point near here, but the point is of another kind: "
@@ -126,7 +127,8 @@ ADVICE = {
     ),
     Status.NEUTRAL: (
         "The orbit closes, and so do those beside it, as around a centre: no cycle that attracts, "
-        "but one of a continuum, and which one depends on the start. simulate follows it."
+        "but one of a continuum, and which one depends on the start; or, with forcing, the mass "
+        "sticks for ever wherever it came to stick. simulate follows it."
     ),
     Status.DEGENERATE: (
         "The condition holds here and beside it, all along the parameter as far as numbers show: "

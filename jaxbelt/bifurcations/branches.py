@@ -8,7 +8,7 @@ where the branch goes on with another signature: to the other side of the point,
 one. At a period doubling the other branch that meets this one there is followed, too.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..activity import note_progress
-from ..cycles.clocked import TimedChain, timed_blocks, turns_of
+from ..cycles.clocked import TimedChain, timed_blocks
 from ..cycles.periodic import PeriodicMotion, is_same_motion, motion_at_unknowns, periodic_from
 from ..cycles.shooting import jacobian
 from ..model.families import Family
@@ -53,6 +53,11 @@ STRAIGHT_ROWS = 3
 STRAIGHT_BRANCH = 0.95
 #: Steps on each side at most.
 MOST_MOTIONS = 400
+#: So many times as large as the first motion of a branch, and 1, a motion grows beyond all bounds.
+UNBOUNDED = 1e3
+#: Parts of the span, of its length, in which no branch is, where another one is looked for, and how
+#: often it is.
+WIDE_GAP, MOST_FURTHER = 0.02, 4
 #: How far beyond a point a motion with another signature is looked for, in parts of the span.
 BEYOND_POINT = (1e-5, 1e-4, 1e-3)
 #: States that a branch reaches beyond a point are no farther than this from it.
@@ -98,12 +103,15 @@ class ForcedLine(NamedTuple):
 
 
 def forced_branches(
-    variation: Variation, span: tuple[float, float], start: PeriodicMotion, value: float
+    line: ForcedLine, begun: MotionRow, further: Callable[[float], MotionRow | None] | None
 ) -> tuple[list[MotionBranch], list[BifurcationPoint]]:
     """The branch of a motion at a value, within a span, to both sides, and those that meet it in
-    period doublings; and the points on them. All in own units."""
-    line = ForcedLine(variation, *span, turns_of(start.oscillator))
-    branches, found, waiting = [], [], [(MotionRow(value, start), True)]
+    period doublings; and the points on them. All in own units.
+
+    further: finds a motion at a value that no branch reaches, whose branch is followed, too.
+    """
+    branches, found, waiting = [], [], [(begun, True)]
+    looked = 0
     while waiting:
         row, is_first = waiting.pop(0)
         sides = [_side_of_point(line, row, -1.0)]
@@ -119,7 +127,32 @@ def forced_branches(
             if is_first and isinstance(point.condition, PeriodDoubling):
                 other = _other_branch(line, point, row.motion)
                 waiting += [(other, False)] if other is not None else []
+        while further and not waiting and looked < MOST_FURTHER:
+            looked += 1
+            gap = _widest_gap(line, branches)
+            other = further(gap.middle) if gap.width > WIDE_GAP * line.length else None
+            waiting += [(other, True)] if other is not None else []
+            if other is None:
+                break
     return branches, sorted(found, key=lambda point: float(point.value))
+
+
+class _Gap(NamedTuple):
+    middle: float
+    width: float
+
+
+def _widest_gap(line: ForcedLine, branches: list[MotionBranch]) -> _Gap:
+    """The widest part of the span that no branch reaches."""
+    reached, widest = line.first, _Gap(line.first, 0.0)
+    ranges = [[row.value for row in one.rows] for one in branches]
+    for low, high in sorted((min(values), max(values)) for values in ranges):
+        if low - reached > widest.width:
+            widest = _Gap(0.5 * (reached + low), low - reached)
+        reached = max(reached, high)
+    if line.last - reached > widest.width:
+        widest = _Gap(0.5 * (reached + line.last), line.last - reached)
+    return widest
 
 
 def _is_known_motion(point: BifurcationPoint, other: BifurcationPoint, line: ForcedLine) -> bool:
@@ -224,12 +257,15 @@ def _branch_leg(
     u, tangent = begun.u, sign * begun.tangent * np.sign(begun.tangent[-1])
     rows, points, step, straight = [], [], FIRST_STEP_OF_BRANCH, STRAIGHT_ROWS
     last, borders, searched = row, [], np.inf
+    size = np.max(np.abs(np.asarray(home.motion.unknowns)[:, :2]))
     while len(rows) < MOST_MOTIONS and step > SHORTEST_STEP_OF_BRANCH:
         solved = leg.corrected(u, tangent, step)
         if not solved.found or solved.tangent @ tangent < STRAIGHT_BRANCH:
             step *= 0.5
             continue
         new = leg.row(solved.u)
+        if np.max(np.abs(leg.start(solved.u))) > UNBOUNDED * (1 + size):
+            return rows, points, last.value
         if not line.first <= new.value <= line.last:
             end = line.first if new.value < line.first else line.last
             rows += _at_end(leg, u, solved.u, end, line)

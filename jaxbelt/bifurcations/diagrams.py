@@ -34,7 +34,7 @@ from ..model.variations import Variation, as_span, varied
 from ..results import Status, draw
 from ..tables import per_belt, table_of
 from .base import BifurcationPoint, given_point
-from .branches import MotionRow, forced_branches
+from .branches import ForcedLine, MotionRow, forced_branches
 from .cells import in_plane_of_paper, region_name
 from .forced import motions_to_begin_from
 from .path import ParameterPath
@@ -163,9 +163,10 @@ def bifurcation_diagram(
         start: For a forced oscillator only, whose diagram is the branch of one periodic motion,
             stable and unstable, with the points on it, and the branches that leave it at period
             doublings (rows and resolution do not count): that motion, or a start (x1, x2) at t = 0
-            that leads to it with the parameter in the middle of the span; None: from where one is
-            found. A branch ends where no motion is found beyond a point, or where it cannot be
-            followed further, see `open_ends`.
+            that leads to it with the parameter in the middle of the span. None: one that is found
+            in the middle of the span, and, where the branches so far do not reach, in the middle of
+            the widest part without one. A branch ends where no motion is found beyond a point, or
+            where it cannot be followed further or grows beyond all bounds, see `open_ends`.
 
     Returns:
         The `BifurcationDiagram`.
@@ -228,12 +229,15 @@ def _is_forced(osc: Any, where: Any, span: Any) -> bool:
     """Whether what is varied knows the time."""
     if isinstance(osc, Oscillator) or not callable(osc):
         return isinstance(osc, Oscillator) and has_clock(osc)
-    first, _ = as_span(span, where)
+    ends = as_span(span, where)
     try:
-        made = osc(first)
+        made = [osc(end) for end in ends]
     except Exception:  # which is told as of any function
         return False
-    return isinstance(made, Oscillator) and has_clock(made)
+    forced = [isinstance(one, Oscillator) and has_clock(one) for one in made]
+    expected = "without the frequency 0, at which a force is constant"
+    require(forced[0] == forced[1], "span", expected, ends)
+    return forced[0]
 
 
 def _forced_diagram(osc: Any, where: Any, span: Any, start: Any) -> BifurcationDiagram:
@@ -249,7 +253,14 @@ def _forced_diagram(osc: Any, where: Any, span: Any, start: Any) -> BifurcationD
     (unit,), length = variation.own.parameters, variation.own.length
     limits = np.array([[first, last]]) / unit
     motion, value = _start_of_branch(variation, limits, start)
-    found, points = forced_branches(variation, (limits[0, 0], limits[0, 1]), motion, value)
+    line = ForcedLine(variation, *limits[0].tolist(), turns_of(motion.oscillator))
+
+    def further(value: float) -> MotionRow | None:
+        motions = motions_to_begin_from(line.at(value), None, line.turns)
+        return MotionRow(value, motions[0]) if motions else None
+
+    begun = MotionRow(value, motion)
+    found, points = forced_branches(line, begun, further if start is None else None)
     branches = rescaled(tuple(_branch_of_motions(one.rows) for one in found), length)
     open_ends = [end * float(unit) for one in found for end in one.open_ends]
     return BifurcationDiagram(

@@ -402,7 +402,8 @@ def solve_system(family: Family, system: Any, z0, p0, status: Array) -> Solution
 def _accuracy(osc: Oscillator, system: Any, z: Array, matrix: Array):
     """The residual, and a bound on the error of p, in its units.
 
-    The bound is the effect of the residual with halved steps, and of rounding.
+    The bound is the effect of the residual, with the steps and with halved ones, whose rounding has
+    any signs, and of rounding in the unknowns.
     """
 
     def value(chain):
@@ -410,9 +411,10 @@ def _accuracy(osc: Oscillator, system: Any, z: Array, matrix: Array):
 
     values = system.chain.on_both_meshes(value)
     weights = jnp.linalg.solve(matrix.T, jnp.zeros(values.shape[1]).at[-1].set(1.0))
-    # Rounding of states; for durations, however long, the velocity cancels it.
-    rounding = 1e-15 * (1 + jnp.max(jnp.abs(z[:, :2]))) * jnp.sum(jnp.abs(weights))
-    return jnp.max(jnp.abs(values[0])), 2 * jnp.abs(jnp.sum(weights * values[1])) + rounding
+    # Rounding of states and times; for durations, however long, the velocity cancels it.
+    rounding = 2e-15 * (1 + jnp.max(jnp.abs(z[:, :-1]))) * jnp.sum(jnp.abs(weights))
+    effect = jnp.max(jnp.abs(values) @ jnp.abs(weights))
+    return jnp.max(jnp.abs(values[0])), 2 * effect + rounding
 
 
 def judged_by(error: Array, family: Family, status: Array) -> Array:

@@ -56,13 +56,13 @@ if TYPE_CHECKING:
 
 #: Runs after which an orbit is given up that comes slowly near to a periodic motion, and one that
 #: does not.
-MOST_RUNS, MOST_RESTLESS = 256, 32
+MOST_SLOW, MOST_RESTLESS = 256, 32
 #: States after n periods that differ by less, relative to their size, may be one motion's; and by
 #: how much they have to be nearer to each other before they are tried again.
 NEARLY_BACK, HARDLY_BACK, NEARER = 1e-6, 1e-2, 0.1
 #: An orbit this near to a stable motion, relative to its size, comes to it; farther away it is
 #: asked, unless the eigenvectors of the motion are nearly parallel, by this condition number.
-TRUSTED, MOST_SKEW = 1e-5, 1e6
+NEAR_MOTION, MOST_SKEW = 1e-5, 1e6
 #: Errors that the steps of integration leave in the equations; with more they are halved, so often.
 EXACT_MOTION, MESH_HALVINGS = 1e-11, 3
 #: Unknowns that still move by less are known: near a fold rounding moves them by 1e-9 and more.
@@ -432,7 +432,7 @@ def attracted(osc: Oscillator, y0: Any, turns: int) -> PeriodicMotion:
     """The periodic motion that a start leads to, of a known oscillator in its own units."""
     y, due = np.asarray(y0, float), 1
     failed: dict[int, float] = {}
-    for run in range(1, MOST_RUNS + 1):
+    for run in range(1, MOST_SLOW + 1):
         followed = arcs_over(osc, y, turns)
         if len(followed.starts) <= PERIODS_AT_ONCE:
             return nothing_found(osc, turns, followed.status or Status.NOT_FINITE.value)
@@ -479,7 +479,7 @@ def _reached(
     if int(motion.status) != Status.OK or not bool(motion.stable):
         return None
     off = followed.starts[-1 - periods] - np.asarray(motion.start)
-    near = np.max(np.abs(off)) < TRUSTED * (1 + np.max(np.abs(followed.starts)))
+    near = np.max(np.abs(off)) < NEAR_MOTION * (1 + np.max(np.abs(followed.starts)))
     return motion if near or _draws_in(osc, motion, off, turns) else None
 
 

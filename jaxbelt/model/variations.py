@@ -58,6 +58,8 @@ GUESSES = 9
 
 #: What varies a parameter of an oscillator without a clock.
 VARIED = "this diagram, scan or set of fractions"
+#: What there is with forcing.
+FOR_FORCED = "jb.bifurcation_diagram(...) of a branch, jb.orbit_diagram or jb.sweep"
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,7 @@ class Variation:
             require(isinstance(osc, Oscillator), argument, expected, told)
             check_scalars(osc)
             if not forced:
-                refuse_clock(osc, VARIED, "jb.simulate")
+                refuse_clock(osc, VARIED, FOR_FORCED)
             leaves = jax.tree.leaves(osc)
             return [jnp.asarray(leaf) for leaf in leaves if is_real(leaf)]
 
@@ -526,7 +528,7 @@ def varied(osc: Any, where: Any, values: Sequence[Any], *, forced: bool = False)
         return Variation.of_function(make, values, forced=forced)
     check_oscillator(osc)
     if not forced:
-        refuse_clock(osc, VARIED, "jb.simulate")
+        refuse_clock(osc, VARIED, FOR_FORCED)
     return Variation.of_leaves(osc, [leaf_index(osc, where)])
 
 

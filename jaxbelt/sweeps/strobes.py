@@ -79,7 +79,7 @@ GROWTH_OF_CHAOS = 10.0
 #: Growth of a tangent, its logarithm, that is rounding.
 STILL = 1e-9
 #: Shares of the time that the mass does not stick, and differences of states, that are rounding.
-CARRIED, ROUNDING = 1e-9, 1e-13
+CARRIED, STANDS_STILL = 1e-9, 1e-13
 #: An extremum is known from a point that is this near in time; steps are cut until there is one.
 NEAR_EXTREMUM = 1e-3
 
@@ -389,7 +389,7 @@ class ForcedAttractor(Observer):
         # A mass that a belt carries is where it was if nothing but rounding says otherwise.
         elapsed = since.astype(x1.dtype) * _strobe_period(osc, seen.turns)
         carried = sum(extent.sticks) >= (1 - CARRIED) * elapsed
-        found = found & (~carried | (away <= ROUNDING * (1 + jnp.abs(x1))))
+        found = found & (~carried | (away <= STANDS_STILL * (1 + jnp.abs(x1))))
         # Nothing pulls a motion to one that lies beside others which repeat as well, and one from
         # which a tangent leads away is no attractor.
         gained = seen.growth.size - known.log

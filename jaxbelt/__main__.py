@@ -1,0 +1,5 @@
+"""`python -m jaxbelt`, which is the command `jaxbelt`."""
+
+from .cli import app
+
+app()
