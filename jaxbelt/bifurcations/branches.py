@@ -23,7 +23,7 @@ from ..cycles.periodic import PeriodicMotion, is_same_motion, motion_at_unknowns
 from ..cycles.shooting import jacobian
 from ..model.families import Family
 from ..model.oscillator import Oscillator
-from ..model.own_units import in_own_units
+from ..model.own_units import OwnOscillator, in_own_units
 from ..model.variations import Variation
 from ..numerics.continuation import Corrected
 from ..results import Status
@@ -98,7 +98,7 @@ class ForcedLine(NamedTuple):
     def length(self) -> float:
         return self.last - self.first
 
-    def at(self, value: float) -> Oscillator:
+    def at(self, value: float) -> OwnOscillator:
         return in_own_units(self.variation.oscillator(np.array([value])))
 
 

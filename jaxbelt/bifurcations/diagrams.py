@@ -253,7 +253,8 @@ def _forced_diagram(osc: Any, where: Any, span: Any, start: Any) -> BifurcationD
     (unit,), length = variation.own.parameters, variation.own.length
     limits = np.array([[first, last]]) / unit
     motion, value = _start_of_branch(variation, limits, start)
-    line = ForcedLine(variation, *limits[0].tolist(), turns_of(motion.oscillator))
+    turns = turns_of(motion.oscillator)
+    line = ForcedLine(variation, float(limits[0, 0]), float(limits[0, 1]), turns)
 
     def further(value: float) -> MotionRow | None:
         motions = motions_to_begin_from(line.at(value), None, line.turns)

@@ -492,7 +492,9 @@ def _draws_in(osc: Oscillator, motion: PeriodicMotion, off: np.ndarray, turns: i
     """
     values, vectors = np.linalg.eig(np.asarray(_monodromy_of(osc, motion.chain, motion.unknowns)))
     turning = np.iscomplexobj(values)
-    basis = np.column_stack([vectors[:, 0].real, vectors[:, 0].imag]) if turning else vectors
+    basis = vectors
+    if turning:
+        basis = np.column_stack([np.real(vectors[:, 0]), np.imag(vectors[:, 0])])
     if not np.linalg.cond(basis) < MOST_SKEW:
         return False
     inside = np.linalg.inv(basis)

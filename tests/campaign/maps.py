@@ -170,14 +170,15 @@ def _not_the_engines(plane: Plane, told: jb.RegionMap, counts: Counter) -> list[
     for cell in rng.integers(told.label.size, size=ASKED).tolist():
         place = np.unravel_index(cell, told.label.shape)
         at = [float(along[i]) for along, i in zip(told.values, place)]
-        osc = package.engines(plane.make(**dict(zip(told.names, at, strict=True))))
+        made = plane.make(**dict(zip(told.names, at, strict=True)))
+        osc = package.engines(made)
         starts = np.column_stack([rng.uniform(-3, 3, STARTS), rng.uniform(-1.5, 1.5, STARTS)])
         seen = paths.label_of(osc, list(map(tuple, starts)))
         if not seen.decided or told.on_line[place]:
             counts["cells undecided"] += 1
             continue
         counts["cells"] += 1
-        name = cells.region_name(plane.make(*at), as_label(seen))
+        name = cells.region_name(made, as_label(seen))
         if name != told.label[place]:
             wrong.append(f"at {at} {told.label[place]}, the engine {name}: {paths.words(seen)}")
     return wrong
