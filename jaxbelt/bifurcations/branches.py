@@ -22,7 +22,6 @@ from ..cycles.clocked import TimedChain, timed_blocks
 from ..cycles.periodic import PeriodicMotion, is_same_motion, motion_at_unknowns, periodic_from
 from ..cycles.shooting import jacobian
 from ..model.families import Family
-from ..model.oscillator import Oscillator
 from ..model.own_units import OwnOscillator, in_own_units
 from ..model.variations import Variation
 from ..numerics.continuation import Corrected
