@@ -49,24 +49,30 @@ def increments(
     Components of the state are kept apart, as scalars: so a batch is an array for each of them.
     """
 
+    # Ways from the start are smaller than states, and so is their rounding.
+    def slopes(way):
+        return field(tuple(a + b for a, b in zip(start, way, strict=True)))
+
     def two_substeps(carry, row):
         before, now, totals = carry
         length, first, *weights = row
-        now = tuple(jnp.where(first == 1, a, b) for a, b in zip(start, now, strict=True))
-        before = tuple(jnp.where(first == 1, a, b) for a, b in zip(start, before, strict=True))
+        goes_on = 1.0 - first
+        now = tuple(goes_on * way for way in now)
+        before = tuple(goes_on * way for way in before)
         stride = 2 * length * h
         # The first substep of a rule leaps from its own place, half as far.
-        middle = _leapt(before, (1 - 0.5 * first) * stride, field(now))
-        new = _leapt(now, stride, field(middle))
+        middle = _leapt(before, (1 - 0.5 * first) * stride, slopes(now))
+        new = _leapt(now, stride, slopes(middle))
         totals = tuple(
-            tuple(sum_ + weight * (a - a0) for sum_, a, a0 in zip(total, new, start, strict=True))
+            tuple(sum_ + weight * way for sum_, way in zip(total, new, strict=True))
             for weight, total in zip(weights, totals, strict=True)
         )
         return (middle, new, totals), None
 
     nothing = tuple(jnp.zeros_like(part) for part in start)
     rows = tuple(map(jnp.asarray, scheme))
-    (_, _, totals), _ = lax.scan(two_substeps, (start, start, (nothing,) * (len(rows) - 2)), rows)
+    begun = nothing, nothing, (nothing,) * (len(rows) - 2)
+    (_, _, totals), _ = lax.scan(two_substeps, begun, rows)
     return totals
 
 
