@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,7 +24,28 @@ from jaxtyping import Array
 from .numerics.compiling import is_concrete, is_outermost, require_own_threads
 from .spelling import did_you_mean, refuse_other_names
 
+#: Other names for the arguments of belts, laws, forces, oscillators and machines.
+OTHER_NAMES = {
+    **{"v": "velocity", "speed": "velocity", "law": "friction", "mu": "friction"},
+    **dict.fromkeys(("n", "normal", "force", "load"), "normal_force"),
+    **{"m": "mass", "k": "stiffness", "spring": "stiffness", "belt": "belts"},
+    **dict.fromkeys(("c", "dashpot", "damper", "zeta"), "damping"),
+    **{"mu_s": "static", "mus": "static", "mu_k": "kinetic", "muk": "kinetic", "mud": "kinetic"},
+    **dict.fromkeys(("freq", "omega", "w"), "frequency"),
+}
 TURN_ON_FLOAT64 = 'jax.config.update("jax_enable_x64", True)'
+
+
+class KnownNames(eqx.Module):
+    """A record that raises a `TypeError`, with the names that it takes, for an unknown argument."""
+
+    def __new__(cls, *_: Any, **given: Any):
+        if given:
+            names = [*inspect.signature(cls.__init__).parameters.values()][1:]
+            if not any(name.kind == name.VAR_KEYWORD for name in names):
+                known = [name.name for name in names]
+                refuse_other_names(cls.__name__, known, given, OTHER_NAMES)
+        return super().__new__(cls)
 
 
 def pick(tree: Any, index: Any) -> Any:

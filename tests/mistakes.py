@@ -96,7 +96,7 @@ MISTAKES = [
         "jb.Oscillator(0.5, machine.belts)",
         r"belts\[0\] must be a Belt, got PhysicalBelt\(.*; the .* Machine is machine\.oscillator$",
     ),
-    ("jb.Oscillator(dampng=0.5, belts=(belt,))", "unexpected keyword argument 'dampng'"),
+    ("jb.Oscillator(dampng=0.5, belts=(belt,))", "takes damping, .*: damping, not dampng"),
     ("jb.plot_sweep(dataset, 'knd')", "variable must be \"kind\", got 'knd'"),
     (
         "jb.Belt(0.3, OwnLaw(lambda r: jnp.ones(3)))",

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ..checks import (
+    KnownNames,
     Rule,
     as_array,
     be_finite,
@@ -40,7 +41,7 @@ from ..dimensions import quantity
 FORCE, FREQUENCY, ANGLE = map(quantity, ("force", "frequency", "angle"))
 
 
-class _Wave(eqx.Module):
+class _Wave(KnownNames):
     """Base of all classes of this module: rules, and a text that constructs them again."""
 
     def rules(self) -> list[Rule]:

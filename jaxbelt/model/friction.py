@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ..checks import (
+    KnownNames,
     Rule,
     as_array,
     as_numbers,
@@ -42,7 +43,7 @@ from ..checks import (
 MU_ROUNDING = 1e-14
 
 
-class AbstractFriction(eqx.Module):
+class AbstractFriction(KnownNames):
     """A friction law: subclass it with `static` and `mu` to define your own.
 
     Attributes:

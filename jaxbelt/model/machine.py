@@ -8,8 +8,7 @@ normal force, max N_i / k; velocity, force and energy follow from these. So the 
 = 1, its largest load is 1, and its laws take speeds in the unit of velocity.
 """
 
-import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -19,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ..checks import (
+    KnownNames,
     check_finite,
     check_nonnegative,
     check_positive,
@@ -28,7 +28,6 @@ from ..checks import (
     require_value,
     scalar,
 )
-from ..spelling import refuse_other_names
 from .forcing import AbstractForce, Oscillating, as_forcing, as_velocity, number_or_oscillating
 from .friction import AbstractFriction, as_friction
 from .oscillator import (
@@ -90,21 +89,9 @@ SI_UNITS: dict[str, tuple[str, Callable[[Units], Any]]] = {
     "frequency": ("rad s-1", lambda units: units.rate),
     "angle": ("rad", lambda units: jnp.ones(())),
 }
-#: Other names for the arguments of `PhysicalBelt` and `Machine`.
-OTHER_NAMES = {
-    **{"v": "velocity", "speed": "velocity", "law": "friction", "mu": "friction"},
-    **dict.fromkeys(("n", "normal", "force", "load"), "normal_force"),
-    **{"m": "mass", "k": "stiffness", "spring": "stiffness", "belt": "belts"},
-    **dict.fromkeys(("c", "dashpot", "damper"), "damping"),
-}
 
 
-def _check_fields(of: Any, given: Iterable[str]) -> None:
-    names = [field.name for field in dataclasses.fields(of)]
-    refuse_other_names(of.__name__, names, given, OTHER_NAMES)
-
-
-class PhysicalBelt(eqx.Module):
+class PhysicalBelt(KnownNames):
     """A belt of a `Machine`, in SI units; it touches the mass while lower < X < upper.
 
     Args:
@@ -129,10 +116,6 @@ class PhysicalBelt(eqx.Module):
     lower: Float[Array, ""] = eqx.field(converter=as_edge("lower"), default=-float("inf"))
     upper: Float[Array, ""] = eqx.field(converter=as_edge("upper"), default=float("inf"))
 
-    def __new__(cls, *_: Any, **given: Any):
-        _check_fields(cls, given)
-        return super().__new__(cls)
-
     def __check_init__(self):
         for name, check in (("velocity", check_finite), ("normal_force", check_nonnegative)):
             value = getattr(self, name)
@@ -155,7 +138,7 @@ class PhysicalBelt(eqx.Module):
         )
 
 
-class Machine(eqx.Module):
+class Machine(KnownNames):
     """A mass on a spring and a dashpot, in contact with one belt or more, in SI units.
 
     `oscillator` is the dimensionless `Oscillator`, which all of this package takes; `units` are its
@@ -182,10 +165,6 @@ class Machine(eqx.Module):
         converter=lambda belts: as_belts(belts, "PhysicalBelt")
     )
     forcing: tuple[AbstractForce, ...] = eqx.field(converter=as_forcing, default=())
-
-    def __new__(cls, *_: Any, **given: Any):
-        _check_fields(cls, given)
-        return super().__new__(cls)
 
     def __check_init__(self):
         check_positive(self.mass, "mass")

@@ -37,6 +37,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from ..checks import (
+    KnownNames,
     Rule,
     as_array,
     be_finite,
@@ -107,7 +108,7 @@ def scaled_edge(edge: Any, factor: ArrayLike) -> Any:
     return jnp.where(is_edge, jnp.where(is_edge, edge, 0.0) * factor, edge)
 
 
-class Belt(eqx.Module):
+class Belt(KnownNames):
     """A rough belt that moves at a given velocity and touches the mass while lower < x1 < upper.
 
     All numbers are dimensionless scalars.
@@ -195,7 +196,7 @@ def _in_numpy(leaf: Any) -> Any:
     return np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf
 
 
-class Oscillator(eqx.Module):
+class Oscillator(KnownNames):
     """A mass on a spring and a dashpot, in contact with one belt or more.
 
     For batches build it inside `jax.vmap`. A negative damping is possible; starts far out may then
