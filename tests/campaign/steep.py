@@ -1,14 +1,19 @@
 """Steep laws: where oscillators lead whose friction falls within 1e-1 to 1e-4 of a belt's velocity.
 
 Half of them have round numbers. Each is asked of `find_cycle`, of `sweep` and of the engine. A case
-of this campaign is a batch of oscillators of one structure, half of it a call of the sweep.
+of this campaign is a batch of oscillators of one structure, half of it a call of the sweep. Two of
+each batch are scanned along the velocity of a belt, twice, the second time warm; a point without a
+name has to say what there is on both sides.
 """
 
 import functools
 import json
+import time
 from dataclasses import replace
 
 import numpy as np
+
+import jaxbelt as jb
 
 from . import cases, compare, package, units
 from .engine import Belt, Oscillator
@@ -38,7 +43,30 @@ def outcome(options, number):
     for is_round, some in ((True, drawn[::2]), (False, drawn[1::2])):
         own = units.drawn(np.random.default_rng((options.seed, number, is_round)), exact=is_round)
         _compare([replace(one_, units=own) for one_ in some], one)
+        _scan(some[0], one)
     return one
+
+
+def _scan(case_, one):
+    """Scan one oscillator, from half of the velocity of its first belt to twice that."""
+    osc = package.oscillator(case_.oscillator)
+    velocity = float(osc.belts[0].velocity)
+    span = tuple(sorted((0.5 * velocity, 2.0 * velocity)))
+    for _ in range(2):
+        began = time.monotonic()
+        points = jb.scan(osc, _first_velocity, span)
+        spent = time.monotonic() - began
+    one.counts["scans"] += 1
+    one.largest["seconds of a scan, warm"] = spent
+    for point in points:
+        unnamed = point.kind == "Unexplained"
+        one.counts["points without a name" if unnamed else "points"] += 1
+        if unnamed and (int(point.status) != jb.Status.UNEXPLAINED or len(point.sides) != 2):
+            one.wrong.append(f"{point!r}\n{package.as_code(case_)}")
+
+
+def _first_velocity(osc):
+    return osc.belts[0].velocity
 
 
 def _compare(batch, one):
