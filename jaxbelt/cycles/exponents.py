@@ -106,8 +106,8 @@ def lyapunov(
         Both exponents with standard errors. A motion that stays bounded, and has settled, is
         chaotic if the first one is more than three standard errors above zero, attracts
         quasi-periodically if it is zero within them, and is periodic if it is that far below: then
-        it is `log(abs(multiplier))` over the period. An orbit that leaves an unstable motion, or grows
-        without bounds, has one above zero, too.
+        it is `log(abs(multiplier))` over the period. An orbit that leaves an unstable motion, or
+        grows without bounds, has one above zero, too.
 
     Raises:
         ValueError: If an argument is impossible, or if the frequencies have no common period.
