@@ -44,7 +44,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     commands/       belts files options tables reproduce simulate diagram orbits map
     commands/       sweep basins verify cache warm
     cli             the command line
-    __main__        the same as `python -m jaxbelt`
+    __main__        the command line by `python -m jaxbelt`
 """
 
 import os

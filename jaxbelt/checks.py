@@ -41,10 +41,9 @@ class KnownNames(eqx.Module):
 
     def __new__(cls, *_: Any, **given: Any):
         if given:
-            names = [*inspect.signature(cls.__init__).parameters.values()][1:]
-            if not any(name.kind == name.VAR_KEYWORD for name in names):
-                known = [name.name for name in names]
-                refuse_other_names(cls.__name__, known, given, OTHER_NAMES)
+            taken = list(inspect.signature(cls.__init__).parameters.values())[1:]
+            if not any(one.kind == one.VAR_KEYWORD for one in taken):
+                refuse_other_names(cls.__name__, [one.name for one in taken], given, OTHER_NAMES)
         return super().__new__(cls)
 
 

@@ -126,32 +126,22 @@ def forced_branches(
             if is_first and isinstance(point.condition, PeriodDoubling):
                 other = _other_branch(line, point, row.motion)
                 waiting += [(other, False)] if other is not None else []
-        while further and not waiting and looked < MOST_FURTHER:
+        if further and not waiting and looked < MOST_FURTHER:
             looked += 1
-            gap = _widest_gap(line, branches)
-            other = further(gap.middle) if gap.width > WIDE_GAP * line.length else None
+            width, middle = _widest_gap(line, branches)
+            other = further(middle) if width > WIDE_GAP * line.length else None
             waiting += [(other, True)] if other is not None else []
-            if other is None:
-                break
     return branches, sorted(found, key=lambda point: float(point.value))
 
 
-class _Gap(NamedTuple):
-    middle: float
-    width: float
-
-
-def _widest_gap(line: ForcedLine, branches: list[MotionBranch]) -> _Gap:
-    """The widest part of the span that no branch reaches."""
-    reached, widest = line.first, _Gap(line.first, 0.0)
-    ranges = [[row.value for row in one.rows] for one in branches]
+def _widest_gap(line: ForcedLine, branches: list[MotionBranch]) -> tuple[float, float]:
+    """The width and the middle of the widest part of the span that no branch reaches."""
+    ranges = [[row.value for row in one.rows] for one in branches] + [[line.last]]
+    reached, gaps = line.first, []
     for low, high in sorted((min(values), max(values)) for values in ranges):
-        if low - reached > widest.width:
-            widest = _Gap(0.5 * (reached + low), low - reached)
+        gaps.append((low - reached, 0.5 * (reached + low)))
         reached = max(reached, high)
-    if line.last - reached > widest.width:
-        widest = _Gap(0.5 * (reached + line.last), line.last - reached)
-    return widest
+    return max(gaps)
 
 
 def _is_known_motion(point: BifurcationPoint, other: BifurcationPoint, line: ForcedLine) -> bool:

@@ -230,14 +230,20 @@ def _is_forced(osc: Any, where: Any, span: Any) -> bool:
     if isinstance(osc, Oscillator) or not callable(osc):
         return isinstance(osc, Oscillator) and has_clock(osc)
     ends = as_span(span, where)
-    try:
-        made = [osc(end) for end in ends]
-    except Exception:  # which is told as of any function
-        return False
-    forced = [isinstance(one, Oscillator) and has_clock(one) for one in made]
+    made = [_made_by(osc, end) for end in ends]
+    clocks = [has_clock(one) for one in made if one is not None]
     expected = "without the frequency 0, at which a force is constant"
-    require(forced[0] == forced[1], "span", expected, ends)
-    return forced[0]
+    require(len(set(clocks)) < 2, "span", expected, ends)
+    return made[0] is not None and clocks[0]
+
+
+def _made_by(make: Any, value: float) -> Oscillator | None:
+    """The oscillator that a function returns, if it does: what it does else is told elsewhere."""
+    try:
+        made = make(value)
+    except Exception:
+        return None
+    return made if isinstance(made, Oscillator) else None
 
 
 def _forced_diagram(osc: Any, where: Any, span: Any, start: Any) -> BifurcationDiagram:

@@ -70,8 +70,8 @@ UNMEASURED = 0.25
 #: Standard errors within which an exponent is zero; per period the error of its computation, and
 #: how large both may be together where a motion is quasiperiodic.
 DEVIATIONS, COMPUTED, RESOLVED = 3.0, 1e-12, 0.01
-#: By so much of its size the largest displacement of a quasiperiodic motion, and of a chaotic one,
-#: may differ in two halves of a run; what differs by more has not settled, or grows without bound.
+#: The largest distances from the origin in the two halves of a run differ by no larger part in a
+#: quasiperiodic motion, and in a chaotic one; else it has not settled, or grows without bound.
 STEADY, STEADY_CHAOS = 0.01, 0.2
 #: The logarithm of how much a tangent grows, at least, while the exponent of chaos is measured: a
 #: motion that grew as much would be seen to grow.
