@@ -15,7 +15,7 @@ from jax import lax
 
 from ..activity import announced
 from ..checks import as_array, as_whole, check_finite, is_concrete, require, require_value
-from ..cycles.cycle import EXACT, warn_of_extrapolation
+from ..cycles.cycle import warn_of_extrapolation
 from ..model.oscillator import Oscillator, check_oscillator, has_clock
 from ..model.parameters import leaf_index
 from ..model.variations import Variation, varied
@@ -24,12 +24,10 @@ from ..results import Status
 from .base import AbstractCondition, BifurcationPoint, given_point
 from .forced import forced_point
 from .path import ParameterPath
-from .scan import MOST_ATTEMPTS, search
+from .scan import MOST_ATTEMPTS, more_exact, search
 
 #: Points found in two ways count as one if they are no farther apart.
 SAME_POINT = 1e-9
-#: A point with a larger error is solved again from a guess so near, in units of the parameter.
-BESIDE_IT = 1e-3
 #: If Newton's method ends this near to the guess after a first step that is no longer than
 #: SHORT_STEP, no nearer point is searched. Of three thousand guesses four led beyond the next
 #: point, to others 0.008, 0.018 and 0.029 away, after first steps of 0.4 and 0.5, and to a corner
@@ -107,7 +105,8 @@ def refine(
     point = condition.point(variation, near, value, room or condition.room)
     if not is_outermost(near, value, point):
         return given_point(point, variation)
-    point = given_point(_bracketed(point, variation, value), variation)
+    point = _bracketed(more_exact(point, condition, variation), variation, value)
+    point = given_point(point, variation)
     warn_of_extrapolation([point.cycle])
     return point
 
@@ -151,7 +150,7 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
         of_kind = [one for one in found if condition.covers(one) and _away(one, guess) <= reach]
         if of_kind:
             nearest = min(of_kind, key=lambda one: _away(one, guess))
-            nearest = _more_exact(nearest, condition, variation, unit)
+            nearest = more_exact(nearest, condition, variation)
             is_nearer = _away(nearest, guess) < away - unit * SAME_POINT
             return replace(nearest, condition=condition) if is_nearer else point
         if away <= reach or attempts > MOST_ATTEMPTS:
@@ -159,23 +158,6 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
     if int(point.status) != Status.OK and unexplained:
         nearest = min(unexplained, key=lambda one: abs(float(one.value) - guess))
         return replace(point, sides=nearest.sides)
-    return point
-
-
-def _more_exact(
-    point: BifurcationPoint, condition: AbstractCondition, variation: Variation, unit: float
-) -> BifurcationPoint:
-    """The point as solved from a nearer guess, if that is more exact.
-
-    The integration steps suit the motion at the guess.
-    """
-    value = float(point.value)
-    for shift in (-BESIDE_IT, BESIDE_IT):
-        if not float(point.error) > unit * EXACT:
-            break
-        again = condition.named_point_from(variation, value + shift * unit)
-        if again is not None and abs(float(again.value) - value) < unit * SAME_POINT:
-            point = min(point, again, key=lambda one: float(one.error))
     return point
 
 
