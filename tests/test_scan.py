@@ -216,8 +216,9 @@ def test_nested_cycles_in_one_mode():
     )
     assert values_of(points) == pytest.approx(expected, abs=1e-9)
     path.find_labels([0.4975, 0.5, 0.5075])
+    unit = path.variation.own.length
     amplitudes = [
-        [float(np.ptp(one.loop.entries[:, 0])) / 2 for one in path.cycles[value]]
+        [unit * float(np.ptp(one.loop.entries[:, 0])) / 2 for one in path.cycles[value]]
         for value in (0.4975, 0.5, 0.5075)
     ]
     assert [len(sizes) for sizes in amplitudes] == [1, 2, 1]

@@ -149,7 +149,7 @@ class Returns:
         self._holds_by_more = any(float(one.static) > float(one.mu(jnp.zeros(()))) for one in laws)
         self._special = np.array([*special, *self._tops_after_sticking()])
         for low, high in self.intervals:
-            self._search(low, high)
+            self._search(low, high, rests)
         self.cycles = self._solved()
         self.gaps = [gap for gap in self.gaps if not self._is_rounding(gap, rests)]
         self.gaps += [gap for gap in _touching_joined(self._leaps) if not self._has_unstable(gap)]
@@ -205,9 +205,7 @@ class Returns:
 
         From a distance on; the first loops that are more than rounding decide.
         """
-        near = np.abs(np.asarray(rests.x1) - low) < NARROWEST * (1 + abs(low))
-        near &= np.asarray(rests.kind) == EquilibriumKind.FIXED_POINT
-        rate = np.asarray(rests.rate)[near & ~np.asarray(rests.neutral)]
+        rate = _rate_at(rests, low)
         beyond = low + away * np.geomspace(1.0, 1e3, TOPS_AT_ONCE)[1:]
         beyond = beyond[beyond < high]
         if not (rate.size and beyond.size):
@@ -252,7 +250,7 @@ class Returns:
 
     # --- dividing -------------------------------------------------------------------------------
 
-    def _search(self, low: float, high: float) -> None:
+    def _search(self, low: float, high: float, rests: Equilibria) -> None:
         """Finds the brackets of cycles with their tops in an interval."""
         tops = self._first_tops(low, high)
         returns = self(tops)
@@ -265,6 +263,10 @@ class Returns:
             order = np.argsort(tops)
             tops, returns = tops[order], returns[order]
         self._collect(tops, returns, low)
+        # A cycle that is smaller than all of these.
+        grows, rate = returns[0] - tops[0], _rate_at(rests, low)
+        if np.any(grows * rate < 0):
+            self.gaps.append((low, float(tops[0])))
 
     def _first_tops(self, low: float, high: float) -> np.ndarray:
         length = high - low
@@ -407,6 +409,13 @@ class Returns:
             return None
         cycle = _if_at_home(solved(behind, pick(loops, 0)), top, 0.0)
         return None if cycle is None else forwards(self.osc, cycle)
+
+
+def _rate_at(rests: Equilibria, x1: float) -> np.ndarray:
+    """The rate of the fixed point there, [1]; [0] where there is none, or a neutral one."""
+    near = np.abs(np.asarray(rests.x1) - x1) < NARROWEST * (1 + abs(x1))
+    near &= np.asarray(rests.kind) == EquilibriumKind.FIXED_POINT
+    return np.asarray(rests.rate)[near & ~np.asarray(rests.neutral)]
 
 
 def _if_at_home(cycle: Cycle, top: float, width: float) -> Cycle | None:
