@@ -256,9 +256,12 @@ def test_a_corner_in_which_the_cycle_ends():
 
 @pytest.mark.slow
 def test_the_passage_of_an_edge_becomes_tangent():
-    """The edge pushes away to both sides, and the cycle that passes it ends there."""
-    points = jb.scan(jb.presets.class_c(0.31, 0.25, 0.7), nu1, (0.16, 0.2))
-    kinds = [jb.FoldOfCycles(), jb.Hopf(), *[jb.SaddleConnection(0, 0)] * 2]
+    """The edge pushes away to both sides, and the cycle that passes it ends there, where it begins
+    and ends at the edge: the attracting cycle at the one point, the unstable one at the other."""
+    osc = jb.presets.class_c(0.31, 0.25, 0.7)
+    points = jb.scan(osc, nu1, (0.16, 0.2))
+    grazes, connects = jb.GrazingEdge(0), jb.SaddleConnection(0, 0)
+    kinds = [jb.FoldOfCycles(), jb.Hopf(), grazes, connects]
     assert [point.condition for point in points] == kinds
 
     def miss(nu):
@@ -293,8 +296,10 @@ def test_the_passage_of_an_edge_becomes_tangent():
         brentq(miss_at_once, 0.185, 0.1855, xtol=1e-14),
     ]
     for point, value in zip(points[2:], expected, strict=True):
-        assert point.value == pytest.approx(value, abs=1e-11)
-        assert point.residual < 1e-12 and point.error < 1e-11
+        near = jb.presets.class_c(0.31, value + 1e-4, 0.7)
+        for one in (point, *(jb.refine(kind, near, where=nu1) for kind in (grazes, connects))):
+            assert one.value == pytest.approx(value, abs=1e-11)
+            assert one.residual < 1e-12 and one.error < 1e-11
 
 
 @pytest.mark.slow(first=True)
