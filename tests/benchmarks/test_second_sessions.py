@@ -6,8 +6,11 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+
+import jaxbelt as jb
 
 #: A session: seconds of `import jaxbelt` with an oscillator, of the first call, of later ones, and
 #: a checksum of the answer.
@@ -85,3 +88,34 @@ def test_warm_calls(benchmark, tmp_path):
     compiled = session(call, tmp_path, kept="0", again=300)
     print(f"\nwarm: {loaded['again'] / compiled['again']:.3f} of the time without")
     assert loaded["answer"] == compiled["answer"]
+
+
+PEER = Path(__file__).with_name("scipy_peer.py")
+#: What the script with SciPy answers, as the package has it; and the runs it makes one of.
+PEER_ANSWERS = {
+    "simulate": (lambda osc, nu0: jb.simulate(osc, (3.0, 0.0), ts=[100.0]).ys[0], 1),
+    "find_cycle": (lambda osc, nu0: jb.find_cycle(osc, (3.0, 0.0)).period, 1),
+    "refine": (lambda osc, nu0: jb.refine(jb.NonsmoothFold(1), osc, where=nu0).value, 1),
+    "sweep": (None, 64),
+}
+
+
+@pytest.mark.parametrize("name", PEER_ANSWERS)
+def test_first_answers_beside_scipy(benchmark, tmp_path, name):
+    """Seconds of the first call in a first and in a second session, beside those of the script; a
+    sweep's are those of 64 runs, times 64."""
+    ours = [session(CALLS[name][0], tmp_path, again=3) for _ in range(2)]
+    command = [sys.executable, str(PEER), name]
+
+    def ask():
+        return json.loads(subprocess.run(command, stdout=subprocess.PIPE, check=True).stdout)
+
+    peer = benchmark.pedantic(ask, rounds=1)
+    answer, times = PEER_ANSWERS[name]
+    print(
+        f"\n{name}: first {ours[0]['first']:.1f} s, second session {ours[1]['first']:.2f} s, "
+        f"again {ours[1]['again']:.4f} s; SciPy {times * peer['seconds']:.2f} s"
+    )
+    if answer is not None:
+        right = answer(jb.presets.class_b(0.45, 0.35), lambda osc: osc.belts[0].velocity)
+        assert peer["answer"] == pytest.approx(right, abs=1e-8)
