@@ -465,3 +465,23 @@ def number(value: Any) -> str:
     if is_concrete(value) and np.ndim(value) == 0:
         return f"{float(value):.12g}"
     return f"{value.dtype}{list(np.shape(value))}"
+
+
+class Parameters(KnownNames):
+    """A record of parameters with rules, whose text constructs it again."""
+
+    def rules(self) -> list[Rule]:
+        """Conditions on the parameters."""
+        return []
+
+    def check(self, owner: str) -> None:
+        """Raises a `ValueError` naming `owner` if a known parameter is out of range."""
+        for rule in type(self).rules(self):
+            rule.enforce(f" of {owner}")
+
+    def __repr__(self) -> str:
+        values = ", ".join(
+            f"{name}={number(value) if eqx.is_array(value) else repr(value)}"
+            for name, value in vars(self).items()
+        )
+        return f"{type(self).__name__}({values})"

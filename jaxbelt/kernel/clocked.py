@@ -52,6 +52,7 @@ from ..numerics.control_points import Polynomial, highest_difference, passage, t
 from ..results import Status
 from .holds import NEEDED_ROUNDING, FirstEnd, hold_from, is_steady
 from .lanes import Lanes, Passage, choose, in_few, materialise
+from .rounds import lanes_in
 from .step import (
     LANDING,
     LANDS_WITHIN,
@@ -102,8 +103,7 @@ def needed_or_rate(osc: Oscillator, mode: Mode, t: Array, x1: Array, x2: Array) 
 
 def timed_lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, t0: Any) -> Lanes:
     """Lanes at the start of their runs, at the time t0, without what an observer adds."""
-    zero = jnp.zeros_like(x1)
-    t = zero + t0
+    t = jnp.zeros_like(x1) + t0
 
     def start(osc, x1, x2, t):
         y = x1, x2, t
@@ -114,29 +114,11 @@ def timed_lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, t0: Any) ->
     mode, rests, forever = of_lanes(start, osc, x1, x2, t)
     finite = jnp.isfinite(x1) & jnp.isfinite(x2) & has_possible_numbers(osc)
     status = jnp.where(forever, Status.STUCK_FOREVER.value, Status.OK.value)
-    status = jnp.where(rests, Status.PSEUDO_FOCUS.value, status)
-    status = jnp.where(finite, status, Status.NOT_FINITE.value)
-    count, h = jnp.zeros_like(run), zero + first_step(rtol)
-    return Lanes(
-        run=run,
-        first_pass=jnp.full_like(run, passes),
-        t=t,
-        x1=x1,
-        x2=x2,
-        a=needed_or_rate(osc, mode, t, x1, x2) + zero,
-        # A steady stick phase is asked for its end before the first step.
-        h=jnp.where(mode.any_stuck, -h, h) if is_steady(osc) else h,
-        pace=zero + STEP_SAFETY / first_step(rtol),
-        mode=mode,
-        events=count,
-        status=status.astype(run.dtype),
-        done=~finite | rests,
-        lower=x2,
-        upper=x2,
-        memory=None,
-        hit=count - 1,
-        until=zero + jnp.inf,
-    )
+    a = needed_or_rate(osc, mode, t, x1, x2)
+    lanes = lanes_in(mode, a, finite, rests, status, run, x1, x2, passes, rtol)
+    # A steady stick phase is asked for its end before the first step.
+    h = jnp.where(mode.any_stuck, -lanes.h, lanes.h) if is_steady(osc) else lanes.h
+    return replace(lanes, t=t, h=h, hit=lanes.events - 1, until=jnp.full_like(t, jnp.inf))
 
 
 class TimedWindow(eqx.Module):

@@ -20,31 +20,42 @@ from .step import STEP_SAFETY, attempt, first_step, take_step, window_of
 STEPS_PER_ROUND = 4
 
 
-def lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol) -> Lanes:
-    """Lanes at the start of their runs, without what an observer adds."""
-    mode = mode_of_state(osc, x1, x2)
-    finite = jnp.isfinite(x1) & jnp.isfinite(x2) & has_possible_numbers(osc)
-    rests = at_focus(osc, x1, x2) if has_edges(osc) else jnp.zeros_like(finite)
-    status = jnp.where(rests, Status.PSEUDO_FOCUS.value, Status.OK.value)
+def lanes_in(mode: Mode, a, finite, rests, status, run, x1, x2, passes, rtol) -> Lanes:
+    """Lanes that begin in a mode at the time 0, without what an observer adds.
+
+    a: x2' there; finite, rests: whether the start is finite, and is a pseudo-focus; status: of
+    other starts.
+    """
+    zero, count = jnp.zeros_like(x1), jnp.zeros_like(run)
+    status = jnp.where(rests, Status.PSEUDO_FOCUS.value, status)
     status = jnp.where(finite, status, Status.NOT_FINITE.value)
-    zero = jnp.zeros_like(x1)
+    h = zero + first_step(rtol)
     return Lanes(
         run=run,
         first_pass=jnp.full_like(run, passes),
         t=zero,
         x1=x1,
         x2=x2,
-        a=mode_acceleration(osc, mode, x1, x2) + zero,
-        h=zero + first_step(rtol),
-        pace=zero + STEP_SAFETY / first_step(rtol),
+        a=a + zero,
+        h=h,
+        pace=STEP_SAFETY / h,
         mode=Mode(tuple(code + zero for code in mode.codes)),
-        events=jnp.zeros_like(run),
+        events=count,
         status=status.astype(run.dtype),
         done=~finite | rests,
         lower=x2,
         upper=x2,
         memory=None,
     )
+
+
+def lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol) -> Lanes:
+    """Lanes at the start of their runs, without what an observer adds."""
+    mode = mode_of_state(osc, x1, x2)
+    finite = jnp.isfinite(x1) & jnp.isfinite(x2) & has_possible_numbers(osc)
+    rests = at_focus(osc, x1, x2) if has_edges(osc) else jnp.zeros_like(finite)
+    a = mode_acceleration(osc, mode, x1, x2)
+    return lanes_in(mode, a, finite, rests, Status.OK.value, run, x1, x2, passes, rtol)
 
 
 class Round(eqx.Module):

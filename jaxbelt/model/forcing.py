@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ..checks import (
-    KnownNames,
+    Parameters,
     Rule,
     as_array,
     be_finite,
@@ -41,8 +41,8 @@ from ..dimensions import quantity
 FORCE, FREQUENCY, ANGLE = map(quantity, ("force", "frequency", "angle"))
 
 
-class _Wave(KnownNames):
-    """Base of all classes of this module: rules, and a text that constructs them again."""
+class _Wave(Parameters):
+    """Base of all classes of this module."""
 
     def rules(self) -> list[Rule]:
         """Conditions on its parameters; a user's force may add to them."""
@@ -52,18 +52,6 @@ class _Wave(KnownNames):
             for name, value in named
             for rule in (be_nonnegative if name == "frequency" else be_finite)(name, value)
         ]
-
-    def check(self, owner: str) -> None:
-        """Raises a `ValueError` naming `owner` if a known parameter is out of range."""
-        for rule in type(self).rules(self):
-            rule.enforce(f" of {owner}")
-
-    def __repr__(self) -> str:
-        values = ", ".join(
-            f"{name}={number(value) if eqx.is_array(value) else repr(value)}"
-            for name, value in vars(self).items()
-        )
-        return f"{type(self).__name__}({values})"
 
 
 class AbstractForce(_Wave):

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ..checks import (
-    KnownNames,
+    Parameters,
     Rule,
     as_array,
     as_numbers,
@@ -43,7 +43,7 @@ from ..checks import (
 MU_ROUNDING = 1e-14
 
 
-class AbstractFriction(KnownNames):
+class AbstractFriction(Parameters):
     """A friction law: subclass it with `static` and `mu` to define your own.
 
     Attributes:
@@ -82,18 +82,6 @@ class AbstractFriction(KnownNames):
     def rules(self) -> list[Rule]:
         """Conditions on its parameters; a user's law may add to them."""
         return _of_static(self.static, self.mu(jnp.zeros(jnp.shape(self.static))))
-
-    def check(self, owner: str) -> None:
-        """Raises a `ValueError` naming `owner` if a known parameter is out of range."""
-        for rule in type(self).rules(self):
-            rule.enforce(f" of {owner}")
-
-    def __repr__(self) -> str:
-        values = ", ".join(
-            f"{name}={number(value) if eqx.is_array(value) else repr(value)}"
-            for name, value in vars(self).items()
-        )
-        return f"{type(self).__name__}({values})"
 
 
 def _of_static(static: ArrayLike, begins: ArrayLike) -> list[Rule]:
