@@ -385,7 +385,10 @@ def _along(result: AlongParameter, machine: Any) -> "xarray.Dataset":
     units, (symbol, size) = units_along(result, values, machine)
     check_machine(result, machine)
     attributes = {"long_name": result.name, **({"units": symbol} if symbol else {})}
-    return _rows_in_units(table, units).assign(value=("row", values * size, attributes))
+    found = _rows_in_units(table, units).assign(value=("row", values * size, attributes))
+    if isinstance(result, BifurcationDiagram) and result.open_ends:
+        found.attrs["open_ends"] = [end * size for end in result.open_ends]
+    return found
 
 
 def _rows_in_units(table: "pandas.DataFrame", units: Units) -> "xarray.Dataset":
@@ -435,7 +438,7 @@ def _dataset(dataset: "xarray.Dataset", machine: Any) -> "xarray.Dataset":
     own = [name for name in axes if name not in ("x1", "x2", "belt", "attractor")]
     units = _units_of_runs(dataset, machine, own)
     vary = sorted(name for name, unit in vars(units).items() if np.ptp(np.asarray(unit)) > 0)
-    changed = {}
+    changed, axes_in_si = {}, {}
     for name, quantity in quantities_of(dataset).items():
         of, _, by = quantity.partition(" / ")
         require_one_of(of, SI_UNITS, f"quantity of {name}")
@@ -446,7 +449,9 @@ def _dataset(dataset: "xarray.Dataset", machine: Any) -> "xarray.Dataset":
         divisor, divisor_size = SI_UNITS.get(by, (by, lambda _: 1.0))
         unit = size(units) / divisor_size(units)
         old = dataset[name]
-        values = old * (float(np.ravel(unit)[0]) if is_axis else unit)
+        if is_axis:
+            unit = axes_in_si[name] = float(np.ravel(unit)[0])
+        values = old * unit
         attributes = old.attrs | {"units": f"{symbol} / ({divisor})" if by else symbol}
         attributes.pop("quantity", None)
         changed[name] = (old.dims, values.transpose(*old.dims).values, attributes)
@@ -457,6 +462,9 @@ def _dataset(dataset: "xarray.Dataset", machine: Any) -> "xarray.Dataset":
     notes = {"units": "SI where a variable says so; else dimensionless"}
     if str(start := dataset.attrs.get("start", "")).startswith("x"):  # not along the axes
         notes["start"] = f"dimensionless: {start}"
+    if axes_in_si and "call" in dataset.attrs:
+        given = f"dataset[name] / {axes_in_si}.get(name, 1.0) for name in"
+        notes["call"] = dataset.attrs["call"].replace("dataset[name] for name in", given)
     return dataset.assign(changed).assign_coords(coordinates).assign_attrs(notes)
 
 

@@ -20,6 +20,7 @@ from jaxbelt.cli import app
 from jaxbelt.commands import files
 from jaxbelt.commands.options import Description
 from jaxbelt.commands.simulate import simulate
+from jaxbelt.model.oscillator import constant_force
 from jaxbelt.model.parameters import names_of
 
 #: Every run of these tests has one shape, and so one compiled program.
@@ -304,6 +305,10 @@ def test_what_is_wrong_is_told_with_its_place(tmp_path, old, new, sentence):
             "speed,mu\n0,0.5\n0.1,high\n",
             "{} must be a CSV file of numbers, got '0.1', 'high' in line 3 of {}",
         ),
+        (
+            "speed,mu\n0,1,0,5\n",
+            "{} must be a CSV file of numbers, got '0', '1', '0', '5' in line 2 of {}",
+        ),
         ("v,mu\n0,0.5\n", "{} must be a CSV file with the columns speed and mu, got {} with v, mu"),
         ("speed,mu\n0,0.5\n", "{at}.speeds in {file} must be two or more, got 1"),
         (None, "{} must be a CSV file, got {}: No such file or directory"),
@@ -318,6 +323,29 @@ def test_what_is_wrong_with_a_table(tmp_path, table, sentence):
     at = "belts[0].friction"
     words = sentence.format(f"{at}.file in {file}", tmp_path / "mu.csv", at=at, file=file)
     assert (result.exit_code, result.stderr) == (2, f"Error: {words}\n")
+
+
+def test_numbers_that_are_possible_together(tmp_path):
+    """An end of one axis is refused only where no ends of the others make it possible."""
+    source = Description(file=written(tmp_path, MACHINE))
+    kinetic, static = "belts[0].friction.kinetic", "belts[0].friction.static"
+    source.check_ends({kinetic: [0.3, 0.6], static: [0.4, 0.9]})
+    for statics in ([0.4, 0.5], [0.4, 0.9]):
+        with pytest.raises(ValueError, match=r"kinetic in .* must be <= static = 0.4, got 0.6"):
+            source.check_ends({kinetic: [0.6], static: statics})
+
+
+def test_the_amplitude_of_a_constant_force_is_that_of_the_file(tmp_path):
+    """It stands in the file beside a phase, which makes a part of it the force."""
+    for kind, unit in (("harmonic", 1 / 300.0), ("base_motion", 1.0)):
+        wave = f'kind = "{kind}"\namplitude = 3.0\nfrequency = 0.0\nphase = 2.0'
+        source = described(tmp_path, f"{MACHINE}[[forcing]]\n{wave}")
+        name = "forcing[0].amplitude"
+        assert eqx.tree_equal(source.at(**{name: 3.0}), source.own)
+        for amplitude in (3.0, -1.5):
+            (push,) = constant_force(source.at(**{name: amplitude}))
+            in_m = float(push * source.machine.units.length)
+            assert in_m == pytest.approx(unit * amplitude * np.cos(2.0), rel=1e-14)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import jaxbelt as jb
-from jaxbelt.model.oscillator import at_time, has_clock
+from jaxbelt.model.oscillator import at_time, constant_force, has_clock
 from tests.campaign import forced, forced_cases, forced_package
 
 #: The engine's runs and ours agree to this where nothing grows: 1e-10 a step, over some 10 steps.
@@ -78,6 +78,33 @@ def test_a_frequency_of_zero_is_a_constant_force_without_a_clock():
     np.testing.assert_allclose(cycle.period, cycle_still.period, atol=1e-11)
     np.testing.assert_allclose(cycle.x1_max, cycle_still.x1_max + push, atol=1e-11)
     assert has_clock(forced_one())
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.3, np.pi])
+def test_constant_forces_of_machines(phase):
+    """A support moved by x and kept there pushes with the stiffness times x; both keep what the
+    user has said of them."""
+    push = 500.0 * 0.01 * cos(phase)
+    belt = jb.PhysicalBelt(0.2, jb.Coulomb(0.6, 0.4), 10.0)
+    for force in (jb.Harmonic(5.0, 0.0, phase), jb.BaseMotion(0.01, 0.0, phase)):
+        machine = jb.Machine(2.0, 500.0, 0.5, (belt,), force)
+        (found,) = constant_force(machine.oscillator)
+        assert float(found * machine.units.force) == pytest.approx(push, rel=1e-14)
+        (kept,) = machine.forcing
+        assert float(kept.amplitude) == float(force.amplitude)
+        assert repr(kept).startswith(f"{type(force).__name__}(amplitude=")
+        assert ("phase" in repr(kept)) == bool(phase)
+
+
+@pytest.mark.parametrize("by_leaf", [True, False])
+def test_a_span_begins_where_a_force_is_constant(by_leaf):
+    osc, where = forced_one(), lambda osc: osc.forcing[0].frequency
+    given = (osc, where) if by_leaf else (lambda w: forced_one(forcing=jb.Harmonic(0.5, w)), None)
+    for ask in (jb.bifurcation_diagram, jb.orbit_diagram):
+        with pytest.raises(
+            ValueError, match=r"^span must be without the frequency 0.*\(0.0, 1.0\)"
+        ):
+            ask(*given, (0.0, 1.0))
 
 
 @pytest.mark.slow(first=True)

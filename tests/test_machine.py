@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -381,6 +382,10 @@ def test_sweeps_in_si():
     assert np.allclose(ours.x1_end, dataset.x1_end * float(units.length), rtol=1e-15)
     assert np.allclose(ours.x1, dataset.x1 * float(units.length), rtol=1e-15)
     assert ours.x1_end.units == ours.x1.units == "m" and ours.x2_end.units == "m s-1"
+    # The call, whose axes are in the oscillator's units, finds them in the dataset.
+    (axes_of_call,) = re.findall(r"\{name: dataset.*?\]\}", ours.attrs["call"])
+    found = eval(axes_of_call, {"dataset": ours})
+    assert all(np.allclose(found[name], dataset[name], rtol=1e-15) for name in ("V", "x1"))
     assert np.allclose(ours.d_x1_end_d_V, dataset.d_x1_end_d_V * float(units.length))
     ratio = float(units.velocity / units.length)
     assert np.allclose(ours.d_x2_end_d_x1, dataset.d_x2_end_d_x1 * ratio)

@@ -10,6 +10,10 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt import Status
+from jaxbelt.kernel.clocked import timed_lanes_at_start
+from jaxbelt.model.own_units import in_own_units
+from jaxbelt.sweeps.moments import Course
+from jaxbelt.sweeps.strobes import ForcedAttractor
 
 
 def bernardo(frequency, amplitude=0.1):
@@ -382,3 +386,23 @@ def test_a_mass_that_swings_with_a_belt_wherever_it_stuck_to_it_has_no_attractor
 
     found = jb.sweep(make, {"amplitude": [0.1, 0.2]}, y0=(0.2, 0.5), t1=2000.0, observe="attractor")
     assert np.all(found.status == Status.NEUTRAL) and np.all(found.n_events == 1)
+
+
+@pytest.mark.parametrize("t", [10.0, 400.0, 3e4])
+def test_a_mass_that_a_belt_carries_has_no_extrema(t):
+    """Rounding of the time makes its velocity vary; steps were cut to a thousandth there."""
+    osc = in_own_units(bernardo(1.7))
+    count, x2 = jnp.zeros(64, jnp.int32), jnp.full(64, 0.7)
+    begun, steps, x1 = jnp.asarray(np.random.default_rng(1).uniform(0.1, 0.5, size=(3, 64)))
+    lanes = timed_lanes_at_start(osc, count, x1, x2, 0, 1e-8, 0.0)
+    seen = ForcedAttractor().start(osc, lanes)
+    seen = dataclasses.replace(seen, repeats=dataclasses.replace(seen.repeats, n=count + 1))
+    begun, ones = t + begun, jnp.ones(64)
+    h = begun + steps - begun
+    ends = (lanes.x1, x2, 0 * x2), (lanes.x1 + steps * x2, x2, 0 * x2)
+    cut = ForcedAttractor()._cut(seen, Course.of_step(*ends, h), begun + steps, ones)
+    np.testing.assert_array_equal(cut, 1.0)
+    # Beside it the mass turns round in the middle of each step.
+    ends = (lanes.x1, 0.1 * h, -0.2 + 0 * h), (lanes.x1, -0.1 * h, -0.2 + 0 * h)
+    cut = ForcedAttractor()._cut(seen, Course.of_step(*ends, h), begun + steps, ones)
+    np.testing.assert_allclose(cut, 0.5, atol=1e-3)

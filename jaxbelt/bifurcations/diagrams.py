@@ -30,7 +30,7 @@ from ..model.events import signature_name
 from ..model.oscillator import Oscillator, has_clock
 from ..model.own_units import in_own_units, rescaled
 from ..model.parameters import leaf_index
-from ..model.variations import Variation, as_span, varied
+from ..model.variations import WITH_A_CLOCK, Variation, as_span, varied
 from ..results import Status, draw
 from ..tables import per_belt, table_of
 from .base import BifurcationPoint, given_point
@@ -232,8 +232,7 @@ def _is_forced(osc: Any, where: Any, span: Any) -> bool:
     ends = as_span(span, where)
     made = [_made_by(osc, end) for end in ends]
     clocks = [has_clock(one) for one in made if one is not None]
-    expected = "without the frequency 0, at which a force is constant"
-    require(len(set(clocks)) < 2, "span", expected, ends)
+    require(len(set(clocks)) < 2, "span", WITH_A_CLOCK, ends)
     return made[0] is not None and clocks[0]
 
 
@@ -254,6 +253,7 @@ def _forced_diagram(osc: Any, where: Any, span: Any, start: Any) -> BifurcationD
     given = varied(osc, where, (first,), forced=True)
     for value in (first, last):
         given.check(value)
+    given.check_clock((first, last))
     ends = np.array([[0.5 * (first + last)], [first], [last]])
     variation = given.in_own_units(*ends)
     (unit,), length = variation.own.parameters, variation.own.length

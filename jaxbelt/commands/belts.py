@@ -68,6 +68,8 @@ def parts_of_belt(text: str) -> tuple[str, dict[str, float], dict[str, float]]:
         name, equals, value = part.partition("=")
         if not equals:
             raise ValueError(f"belt {text!r} must have name=value after its velocity, got {part!r}")
+        if name.strip() in words:
+            raise ValueError(f"belt {text!r} must have each name once, got {name.strip()} twice")
         words[name.strip()] = value
     name_of_law = words.pop("law", "conti").strip()
     if name_of_law not in LAWS:

@@ -73,7 +73,8 @@ def diagram(
 
     With forcing it is the branch of one periodic motion, stable and unstable, and what leaves it at
     period doublings: the motion that **--start** leads to in the middle of the span, or one that is
-    found. Of a machine all is in SI units.
+    found. Values at which a branch could not be followed further, and no point says why, are
+    printed, and are the open_ends of --json. Of a machine all is in SI units.
 
     An oscillator is described as for **simulate**; the parameter that varies needs no value. Takes
     some ten seconds, mostly to compile; longer with contact edges.
@@ -119,11 +120,15 @@ def diagram(
     symbol, size = unit
     regions = [{"from": a * size, "to": b * size, "name": name} for a, b, name in found.regions]
     rows_of_points = _as_rows(points)
+    open_ends = [end * size for end in found.open_ends]
     data = {"parameter": found.name, "points": rows_of_points, "regions": regions}
+    data |= {"open_ends": open_ends}
     lines = [repr(found), *map(repr, found.points)]
     if described.machine:
         data |= {"parameter": parameter, "unit": symbol}
         counts = f"{len(found.points)} points, {len(found.branches)} branches"
+        if open_ends:
+            counts += f", not followed beyond {', '.join(f'{end:.6g}' for end in open_ends)}"
         lines = [f"{headed(parameter, symbol)} from {span[0]:g} to {span[1]:g}: {counts}"]
         lines += [
             ", ".join(f"{k} {v}" for k, v in row.items() if v != "") for row in rows_of_points

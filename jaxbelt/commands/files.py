@@ -92,7 +92,7 @@ def read_table(path: Path, place: Place) -> tuple[list[float], list[float]]:
             if not {*COLUMNS} <= {*names}:
                 came = f"{path} with {', '.join(names) or 'none'}"
                 raise place.must("be a CSV file with the columns speed and mu", came)
-            rows = [(reader.line_num, [row[name] for name in COLUMNS]) for row in reader]
+            rows = [(reader.line_num, _cells(row)) for row in reader]
     except OSError as error:
         raise place.must("be a CSV file", f"{path}: {error.strerror}") from None
     except UnicodeDecodeError:
@@ -100,13 +100,20 @@ def read_table(path: Path, place: Place) -> tuple[list[float], list[float]]:
     found: list[list[float]] = []
     for line, row in rows:
         try:
-            found.append([float(word) for word in row])
+            speed, mu = map(float, row)
+            found.append([speed, mu])
         except (TypeError, ValueError):
             came = ", ".join(map(repr, row))
             raise place.must(
                 "be a CSV file of numbers", f"{came} in line {line} of {path}"
             ) from None
     return [speed for speed, _ in found], [mu for _, mu in found]
+
+
+def _cells(row: dict[Any, Any]) -> list[Any]:
+    """Speed and coefficient of a row; of one with more cells than columns all cells."""
+    cells = [row[name] for name in COLUMNS]
+    return [*cells, *row[None]] if None in row else cells
 
 
 def described_by(data: dict[str, Any], file: str) -> "jb.Machine | jb.Oscillator":
@@ -246,18 +253,19 @@ class FromFile:
         with jax.ensure_compile_time_eval():
             return unit_of(self.paths[name], self.own, self.machine.units)
 
-    def check(self, name: str, value: float) -> None:
-        """Raises in the words of the file where a value of a parameter is impossible."""
+    def check(self, values: dict[str, float]) -> None:
+        """Raises in the words of the file where values of parameters are impossible together."""
         data = copy.deepcopy(self.data)
-        path = name if self.machine else self.paths[name]
-        here: Any = data
-        *steps, last = re.findall(r"[^.\[\]]+", path)
-        for step in steps:
-            if not step.isdecimal():
-                here = here[step]
-            elif isinstance(here, list):
-                here = here[int(step)]
-        here[last] = value
+        for name, value in values.items():
+            path = name if self.machine else self.paths[name]
+            here: Any = data
+            *steps, last = re.findall(r"[^.\[\]]+", path)
+            for step in steps:
+                if not step.isdecimal():
+                    here = here[step]
+                elif isinstance(here, list):
+                    here = here[int(step)]
+            here[last] = value
         described_by(data, self.file)
 
     def at(self, **values: Any) -> "jb.Oscillator":

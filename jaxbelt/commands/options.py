@@ -15,9 +15,10 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -109,6 +110,8 @@ def turn_on_float64() -> None:
 def outputs(out: Path, *ends: str) -> list[Path]:
     """Paths of the files that `out` stands for; raises, before anything is computed, if one
     cannot be written."""
+    if not out.name:
+        raise ValueError(f"out must be the beginning of files' names, got {str(out)!r}")
     paths = [out.with_name(out.name + end) for end in ends]
     for path in paths:
         check_out(path)
@@ -433,16 +436,34 @@ class Description:
 
         from ..model.parameters import names_of
 
-        self.check_ends(name, span)
+        self.check_ends({name: span})
         osc, (_, size) = self.oscillator(), self.unit(name)
         place, (first, last) = names_of(osc).index(path), span
         return osc, lambda osc: jax.tree.leaves(osc)[place], (first / size, last / size)
 
-    def check_ends(self, name: str, values: Sequence[float]) -> None:
-        """Raises where the first or the last value of a parameter of a file is impossible."""
-        if self.source:
-            for value in (values[0], values[-1]):
-                self.source.check(name, value)
+    def check_ends(self, axes: Mapping[str, Sequence[float]]) -> None:
+        """Raises where the first or the last value of a parameter of a file is impossible, whatever
+        the others that vary are."""
+        if self.source is None:
+            return
+        ends = {name: (values[0], values[-1]) for name, values in axes.items()}
+        for name, own in ends.items():
+            for value in own:
+                corners = product(*((ends | {name: (value,)}).values()))
+                errors = [
+                    self._error_at(dict(zip(ends, corner, strict=True))) for corner in corners
+                ]
+                if all(errors):
+                    raise ValueError(errors[0])
+
+    def _error_at(self, values: dict[str, float]) -> str:
+        """What is wrong with values of parameters of a file, "" where nothing is."""
+        assert self.source is not None
+        try:
+            self.source.check(values)
+        except ValueError as error:
+            return str(error)
+        return ""
 
     def unit(self, name: str) -> tuple[str, float]:
         """Unit of a parameter of a machine, and the size of one unit of the oscillator in it."""

@@ -81,7 +81,7 @@ def sweep(
         float | None,
         option(
             "End of each run; of a machine in s.",
-            "30000 for attractors, 100 for the final state, 1000 for exponents",
+            "30000 for attractors, 100 for the final state, 1000 for exponents, dimensionless",
         ),
     ] = None,
     tolerance: Annotated[float | None, tolerance_of("1e-8")] = None,
@@ -161,8 +161,7 @@ def sweep(
         check_out(out.with_suffix(".png"))
         turn_on_float64()
         own = [name for name in values if name not in ("x1", "x2")]
-        for name in own:
-            described.check_ends(name, values[name])
+        described.check_ends({name: values[name] for name in own})
         make = described.along(own)
         asked["t1"] = ENDS[observe] if t1 is None else described.dimensionless(t1, "time")
         for name, quantity in (("x1", "length"), ("x2", "velocity")):

@@ -137,7 +137,7 @@ class StepClock(NamedTuple):
         forces, others = [], []
         for one in osc.forcing:
             if isinstance(one, ConstantForce):
-                forces.append(_Constant(one.amplitude))
+                forces.append(_Constant(one.push))
             elif isinstance(one, Harmonic | BaseMotion):
                 turn = osc.damping * one.frequency if isinstance(one, BaseMotion) else 0.0
                 forces.append(wave(0.0, one.amplitude, one.frequency, one.phase, turn))
@@ -161,7 +161,9 @@ class StepClock(NamedTuple):
             pushes.append(materialise(force.on_mass(time, self.osc.damping), self.ones))
         rows = zip(self.osc.belts, self.velocities, self.loads, strict=True)
         belts = tuple(_belt(belt, v, load, c) for belt, v, load in rows)
-        forcing = tuple(_wave_unchecked(ConstantForce, amplitude=push) for push in pushes)
+        forcing = tuple(
+            _wave_unchecked(ConstantForce, amplitude=push, phase=None) for push in pushes
+        )
         return _wave_unchecked(Oscillator, **vars(self.osc) | dict(belts=belts, forcing=forcing))
 
     def carried(self, mode: Mode, x1: Array, c: float) -> tuple[Array, Array]:

@@ -14,7 +14,7 @@ clock, and all of this package takes it.
 
 import abc
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -136,29 +136,49 @@ class ForceInUnits(AbstractForce):
 
 
 class ConstantForce(AbstractForce):
-    """A constant force, as of an incline: a `Harmonic` with the frequency 0. No clock."""
+    """A constant force, as of an incline: a `Harmonic` with the frequency 0. No clock.
 
-    amplitude: Float[Array, ""] = eqx.field(converter=scalar("amplitude"), metadata=FORCE)
+    phase: None stands for 0.
+    """
 
-    def __init__(self, amplitude: ArrayLike):
-        self.amplitude = amplitude  # pyright: ignore[reportAttributeAccessIssue]
+    amplitude: Float[Array, ""] = eqx.field(metadata=FORCE)
+    phase: Float[Array, ""] | None = eqx.field(default=None, metadata=ANGLE)
+
+    wave: ClassVar[str] = "Harmonic"
 
     @property
     def frequency(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
         return jnp.zeros(())
 
+    @property
+    def push(self) -> Array:
+        """The force over the stiffness, amplitude cos(phase)."""
+        return self.amplitude if self.phase is None else self.amplitude * _cosine(self.phase)
+
     def force(self, t: Array) -> Array:
         """The force over the stiffness, at every time."""
-        return self.amplitude
+        return self.push
 
     def bound(self, damping: ArrayLike) -> Array:
-        return jnp.abs(self.amplitude)
+        return jnp.abs(self.push)
 
     def in_units_of(self, force: ArrayLike, length: ArrayLike, time: ArrayLike) -> AbstractForce:
-        return _made(ConstantForce, amplitude=self.amplitude / force)
+        return _made(ConstantForce, amplitude=self.amplitude / force, phase=self.phase)
 
     def __repr__(self) -> str:
-        return f"Harmonic(amplitude={number(self.amplitude)}, frequency=0)"
+        phase = "" if self.phase is None else f", phase={number(self.phase)}"
+        return f"{self.wave}(amplitude={number(self.amplitude)}, frequency=0{phase})"
+
+
+class ConstantShift(ConstantForce):
+    """A support that is displaced and stands still: a `BaseMotion` with the frequency 0."""
+
+    amplitude: Float[Array, ""] = eqx.field(metadata=quantity("length"))
+
+    wave: ClassVar[str] = "BaseMotion"
+
+    def in_units_of(self, force: ArrayLike, length: ArrayLike, time: ArrayLike) -> AbstractForce:
+        return _made(ConstantShift, amplitude=self.amplitude / length, phase=self.phase)
 
 
 class _Sinusoid(AbstractForce):
@@ -306,9 +326,9 @@ def _made(kind: type, /, **fields: Any) -> Any:
     return made
 
 
-def _is_zero(frequency: Any) -> bool:
-    """Whether a frequency is known to be 0."""
-    return is_concrete(frequency) and bool(np.all(np.asarray(frequency) == 0))
+def _is_zero(value: Any) -> bool:
+    """Whether a number is known to be 0."""
+    return is_concrete(value) and bool(np.all(np.asarray(value) == 0))
 
 
 def as_velocity(value: Any) -> Any:
@@ -357,7 +377,9 @@ def as_forcing(forcing: Any) -> tuple[AbstractForce, ...]:
 def _without_frequency(force: AbstractForce) -> AbstractForce:
     if not isinstance(force, _Sinusoid) or not _is_zero(force.frequency):
         return force
-    return ConstantForce(force.amplitude * _cosine(force.phase))
+    phase = None if _is_zero(force.phase) else force.phase
+    kind = ConstantShift if isinstance(force, BaseMotion) else ConstantForce
+    return _made(kind, amplitude=force.amplitude, phase=phase)
 
 
 #: Users' forces whose `force` was traced.

@@ -316,6 +316,7 @@ def at_time(osc: Oscillator, t: Array) -> Oscillator:
     )
     force, still = object.__new__(ConstantForce), object.__new__(Oscillator)
     object.__setattr__(force, "amplitude", total)
+    object.__setattr__(force, "phase", None)
     belts = tuple(_belt_at(belt, t) for belt in osc.belts)
     fields = dict(damping=osc.damping, belts=belts, omega=osc.omega, forcing=(force,))
     for name, value in fields.items():
@@ -341,7 +342,7 @@ def constant_force(osc: Oscillator) -> list[Array]:
     """The constant forces on the mass, each; a `TypeError` for one that has a clock."""
     if not all(isinstance(force, ConstantForce) for force in osc.forcing):
         raise TypeError("the forces of an oscillator with a clock are those of `at_time`")
-    return [force.amplitude for force in osc.forcing if isinstance(force, ConstantForce)]
+    return [force.push for force in osc.forcing if isinstance(force, ConstantForce)]
 
 
 def check_oscillator(osc: Any, field: str = "osc") -> None:

@@ -31,6 +31,8 @@ from .oscillator import (
     Oscillator,
     check_oscillator,
     check_scalars,
+    frequencies,
+    has_clock,
     has_edges,
     interval_ends,
     its_oscillator,
@@ -56,6 +58,8 @@ OFTEN = 64
 GUESSES = 9
 
 
+#: The spans of a parameter that a forced oscillator may have.
+WITH_A_CLOCK = "without the frequency 0, at which a force is constant"
 #: What varies a parameter of an oscillator without a clock.
 VARIED = "this diagram, scan or set of fractions"
 #: What there is with forcing.
@@ -314,6 +318,12 @@ class Variation:
             Oscillator.check(self.make(*map(np.float64, values)))
         else:
             Oscillator.check(self.line.at(np.array(values)))
+
+    def check_clock(self, span: Sequence[float]) -> None:
+        """Raises a `ValueError` if a force is constant at an end of a span of one parameter."""
+        made = [self.oscillator(np.array([value])) for value in span]
+        fine = all(has_clock(osc) and all(map(bool, frequencies(osc))) for osc in made)
+        require(fine, "span", WITH_A_CLOCK, tuple(map(float, span)))
 
     def held(self, axis: int, value: float) -> "Variation":
         """The variation of the other of two parameters."""

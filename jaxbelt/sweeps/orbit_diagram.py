@@ -217,8 +217,9 @@ def orbit_diagram(
     if sense is not None:
         require_one_of(sense, tuple(SENSES), "sense")
         require_value(len(starts) == 1, "y0", "one start where sense is given", y0)
-    example = variation.oscillator(np.array([first]))
-    if has_clock(example):
+    example, other = (variation.oscillator(np.array([value])) for value in (first, last))
+    if has_clock(example) or has_clock(other):
+        variation.check_clock((first, last))
         at = AtPhase() if at is None else at
         require_value(isinstance(at, AtPhase), "at", "an AtPhase, as osc is forced", at)
     else:
@@ -266,6 +267,7 @@ class Sampling:
         values = evenly_spaced(first, last, self.rows)
         grid = Grid(self._make, {"parameter": values}, (0.0, 0.0))
         if isinstance(self.at, AtPhase):
+            self.variation.check_clock((first, last))
             return self._strobed(grid, values)
         found = self._from_starts(grid, Attractor(), _beside_attractor(grid), LONG_ENOUGH)
         # Codes of runs that are not finite are NaN.

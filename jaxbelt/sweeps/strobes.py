@@ -29,7 +29,7 @@ from ..cycles.exponents import BLOCKS
 from ..cycles.settling import way_left
 from ..kernel.clocked import of_lanes, rate_of_stick
 from ..kernel.lanes import Lanes, Observer, Passage, Variable, choose, in_few, materialise
-from ..model.instants import field_at, guards_at
+from ..model.instants import blur, field_at, guards_at
 from ..model.modes import Mode, any_of, mode_acceleration, select
 from ..model.oscillator import at_time, frequencies
 from ..model.own_units import OwnOscillator
@@ -81,7 +81,9 @@ STILL = 1e-9
 #: Shares of the time that the mass does not stick, and differences of states, that are rounding.
 CARRIED, STANDS_STILL = 1e-9, 1e-13
 #: An extremum is known from a point that is this near in time; steps are cut until there is one.
-NEAR_EXTREMUM = 1e-3
+#: Where x1 or x2 change by less in a quarter of a step, times `blur` and the size of the motion,
+#: what seems to be one is rounding, as in a stick phase.
+NEAR_EXTREMUM, HARDLY_CHANGES = 1e-3, 1e-13
 
 
 class _Repeats(eqx.Module):
@@ -293,7 +295,7 @@ class ForcedAttractor(Observer):
         until = jnp.where(strobe > lanes.t, jnp.minimum(t1, strobe), t1)
         new = take_step(osc, window, ones, lanes, until, rtol, atol)
         course = course_of_step(osc, lanes, new, ones)
-        theta = self._cut(seen, course, ones)
+        theta = self._cut(seen, course, new.t, ones)
         cut = theta < 1
         new = choose(cut, replace(lanes, h=theta * course.duration), new)
         h = jnp.where(cut, 0.0, course.duration)
@@ -334,17 +336,19 @@ class ForcedAttractor(Observer):
             extent = extent.with_point(x1, x2 + way * (a + 0.5 * way * jerk))
         return extent
 
-    def _cut(self, seen: _RunSoFar, course: Course, ones: Array) -> Array:
-        """The fraction of a step that ends at its first extremum of x1 or x2; 1 where there is none
-        inside, or where none is wanted."""
+    def _cut(self, seen: _RunSoFar, course: Course, t: Array, ones: Array) -> Array:
+        """The fraction of a step to the time t that ends at its first extremum of x1 or x2; 1 where
+        there is none inside, or where none is wanted."""
         h = course.duration
         theta = jnp.ones_like(h)
         asked = (seen.repeats.n > 0) & (seen.kind == UNDECIDED) & (h > NEAR_EXTREMUM)
+        size = 1 + sum(b - a for a, b in zip(seen.extent.low, seen.extent.high, strict=True))
+        least = HARDLY_CHANGES * blur(t) * size
         at = [course.velocity(jnp.full_like(h, k / 4)) for k in range(5)]
         for values in zip(*at, strict=True):
             for k in reversed(range(4)):
                 a, b = values[k], values[k + 1]
-                crosses = (a * b < 0) & asked
+                crosses = ((a * b < 0) | (b == 0)) & (jnp.abs(a - b) > least) & asked
                 root = (k + a / jnp.where(crosses, a - b, 1.0)) / 4
                 near = jnp.minimum(root, 1 - root)
                 inside = crosses & (near * h > 0.5 * NEAR_EXTREMUM) & (near > LEAST_CUT)
