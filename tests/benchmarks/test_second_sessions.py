@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import jaxbelt as jb
@@ -93,7 +94,7 @@ def test_warm_calls(benchmark, tmp_path):
 PEER = Path(__file__).with_name("scipy_peer.py")
 #: What the script with SciPy answers, as the package has it; and the runs it makes one of.
 PEER_ANSWERS = {
-    "simulate": (lambda osc, nu0: jb.simulate(osc, (3.0, 0.0), ts=[100.0]).ys[0], 1),
+    "simulate": (lambda osc, nu0: jb.simulate(osc, (3.0, 0.0), 100.0, ts=[100.0]).ys[0], 1),
     "find_cycle": (lambda osc, nu0: jb.find_cycle(osc, (3.0, 0.0)).period, 1),
     "refine": (lambda osc, nu0: jb.refine(jb.NonsmoothFold(1), osc, where=nu0).value, 1),
     "sweep": (None, 64),
@@ -118,4 +119,4 @@ def test_first_answers_beside_scipy(benchmark, tmp_path, name):
     )
     if answer is not None:
         right = answer(jb.presets.class_b(0.45, 0.35), lambda osc: osc.belts[0].velocity)
-        assert peer["answer"] == pytest.approx(right, abs=1e-8)
+        assert peer["answer"] == pytest.approx(np.asarray(right), abs=1e-8)
