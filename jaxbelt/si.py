@@ -104,7 +104,7 @@ def in_si(
       with the branch -1. `value`, of the parameter, is in m/s for the velocity of a belt, in N for
       a load (the normal force), in m for a contact edge, in N s/m for the damping, in rad/s for the
       frequency of a force, in N for its amplitude (in m for that of a support); the argument of a
-      function stays as the function takes it.
+      function stays as the function takes it. The `open_ends` of a diagram are an attribute.
     - a dataset: its own variables, with derivatives by starts and parameters where the units are
       the same in all runs. Results of a user's observable stay dimensionless unless they state
       their dimension, `dataset.largest.attrs["quantity"] = "length"`, and so does the attribute

@@ -90,7 +90,8 @@ def campaign(folder: Path, observe: str, kills: int, seed: int) -> dict[str, int
         found = jb.verify(store)
         assert not found.bad, found
         told["blocks seen done"] += len(found.done)
-        longest *= 1 if found.done else 2
+        if not found.done:
+            longest *= 2
         if process.exitcode == 0 or found.finished:
             assert found.finished and Kept(store).identical_values(whole)
             told["stores"] += 1

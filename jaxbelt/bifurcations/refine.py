@@ -105,7 +105,7 @@ def refine(
     point = condition.point(variation, near, value, room or condition.room)
     if not is_outermost(near, value, point):
         return given_point(point, variation)
-    point = _bracketed(more_exact(point, condition, variation), variation, value)
+    point = more_exact(_bracketed(point, variation, value), variation)
     point = given_point(point, variation)
     warn_of_extrapolation([point.cycle])
     return point
@@ -150,7 +150,7 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
         of_kind = [one for one in found if condition.covers(one) and _away(one, guess) <= reach]
         if of_kind:
             nearest = min(of_kind, key=lambda one: _away(one, guess))
-            nearest = more_exact(nearest, condition, variation)
+            nearest = more_exact(nearest, variation)
             is_nearer = _away(nearest, guess) < away - unit * SAME_POINT
             return replace(nearest, condition=condition) if is_nearer else point
         if away <= reach or attempts > MOST_ATTEMPTS:

@@ -192,7 +192,7 @@ def _searched_interval(
             is_narrow, is_near = b - a <= NEAR * path.length, b - a <= near * path.length
             point = _explained(path, a, b) if is_near else None
             if point is not None and _accepts(path, a, b, point):
-                point = more_exact(point, point.condition, path.variation)
+                point = more_exact(point, path.variation)
                 # The interval on the other side of a fold may have led to it already.
                 for one in (point, *_beside_it(path, a, b, point)):
                     if not any(_is_same_point(one, other) for other in points):
@@ -244,9 +244,7 @@ def _is_same_point(point: BifurcationPoint, other: BifurcationPoint) -> bool:
     return is_same(point.cycle, other.cycle)
 
 
-def more_exact(
-    point: BifurcationPoint, condition: AbstractCondition, variation: Variation
-) -> BifurcationPoint:
+def more_exact(point: BifurcationPoint, variation: Variation) -> BifurcationPoint:
     """The point as solved from guesses on both sides of it, if that is more exact.
 
     The integration steps suit the motion at the guess; and from afar Newton's method may end at a
@@ -263,8 +261,8 @@ def more_exact(
             variation.check(value + shift * unit)
         except ValueError:
             continue  # there is no oscillator on that side
-        again = condition.named_point_from(variation, value + shift * unit)
-        if again is not None and condition.covers(again) and is_at_one_value(point, again):
+        again = point.condition.named_point_from(variation, value + shift * unit)
+        if again is not None and point.condition.covers(again) and is_at_one_value(point, again):
             again = replace(again, condition=point.condition)
             point = min(point, again, key=lambda one: float(one.error))
     return point

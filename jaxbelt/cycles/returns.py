@@ -412,7 +412,7 @@ class Returns:
 
 
 def _rate_at(rests: Equilibria, x1: float) -> np.ndarray:
-    """The rate of the fixed point there, [1]; [0] where there is none, or a neutral one."""
+    """The rate of the fixed point there; no number where there is none, or a neutral one."""
     near = np.abs(np.asarray(rests.x1) - x1) < NARROWEST * (1 + abs(x1))
     near &= np.asarray(rests.kind) == EquilibriumKind.FIXED_POINT
     return np.asarray(rests.rate)[near & ~np.asarray(rests.neutral)]
