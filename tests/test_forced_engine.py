@@ -805,3 +805,24 @@ def test_a_batch_has_no_run_that_is_lost():
     assert not any(run.status in (forced.STEPS, forced.NOT_FINITE, forced.CORNER) for run in runs)
     assert all(np.all(np.isfinite(run.y_end)) for run in runs)
     assert max(abs(run.y_end[0]) for run in runs) < inf
+
+
+@pytest.mark.parametrize("x2", [-0.02, -0.005, -0.001])
+def test_short_arcs_from_an_edge_end_where_scipy_says(x2):
+    """Steep friction: over 0.02 units of time a rule of order four was off by 5e-9."""
+    steep = ("conti", 1.3, 0.9, 7.4, 0.16)
+    osc = Oscillator(0.5, (Belt(-0.4, steep, 0.5, lower=0.0),), (Harmonic(0.2, 0.4, -1.7),))
+
+    def rates(t, y):
+        r = abs(-0.4 - y[1])
+        mu = (1.3 - 0.9) / (1 + 7.4 * r) + 0.9 + 0.16 * r**2
+        return y[1], -y[0] - 0.5 * y[1] - 0.5 * mu + 0.2 * np.cos(0.4 * t - 1.7)
+
+    def back(t, y):
+        return y[0] if t > 1e-5 else -1.0
+
+    back.direction = -1
+    run = forced.simulate(osc, (0.0, -x2), 1.0, mode=(-1,))
+    peer = solve_ivp(rates, (0, 1), (0.0, -x2), "DOP853", events=back, rtol=1e-13, atol=1e-16)
+    assert run.kind[0] == EDGE and 1e-3 < run.t[0] < 0.1
+    np.testing.assert_allclose(run.t[0], peer.t_events[0][0], rtol=1e-10)

@@ -114,6 +114,9 @@ __all__ = [
 ]
 
 _C = np.ascontiguousarray(_dop853.C[:_N])
+#: Gauss's rule of order ten on [0, 1].
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
+_NODES, _WEIGHTS = 0.5 * (1 + _NODES), 0.5 * _WEIGHTS
 
 #: Longest step; shortest that is still halved.
 _LONGEST, _SHORTEST = 0.5, 1e-10
@@ -728,15 +731,15 @@ def _slip_root(z, w, B, F, s, L, line, order, shift, t, x1, x2, a, right, f_left
 @njit(nogil=True, cache=True, error_model="numpy")
 def _slip_root_beside(z, w, B, F, s, L, line, t, x1, x2, a, right, V, K):
     """As `_stick_root_beside`; the length and the state there."""
-    _, first, _ = _slip_line(z, w, B, F, s, L, line, t, x1, x2, a)
     left, end = 0.0, right
     for _ in range(60):
-        h = 0.5 * (left + right)
-        y1, y2 = _advance(z, w, B, F, s, t, x1, x2, a, 0.5 * h, V, K)
-        _, middle, _ = _slip_line(z, w, B, F, s, L, line, t + 0.5 * h, y1, y2, K[_N])
-        y1, y2 = _advance(z, w, B, F, s, t, x1, x2, a, h, V, K)
-        _, last, _ = _slip_line(z, w, B, F, s, L, line, t + h, y1, y2, K[_N])
-        if first + 4 * middle + last > 0:
+        h, total = 0.5 * (left + right), 0.0
+        for i in range(_NODES.size):
+            part = _NODES[i] * h
+            y1, y2 = _advance(z, w, B, F, s, t, x1, x2, a, part, V, K)
+            _, slope, _ = _slip_line(z, w, B, F, s, L, line, t + part, y1, y2, K[_N])
+            total += _WEIGHTS[i] * slope
+        if total > 0:
             left = h
         else:
             right = h
@@ -864,15 +867,14 @@ def _stick_root_beside(z, w, B, F, s, k, start, x1, L, line, right, R):
 
     All its values in between are rounding; its mean slope, which also vanishes there, is not.
     """
-    _stick_line(z, w, B, F, s, k, start, x1, L, line, start, 0.0, R)
-    first = R[2]
     left, end = start, right
     for _ in range(60):
-        t = 0.5 * (left + right)
-        _stick_line(z, w, B, F, s, k, start, x1, L, line, 0.5 * (start + t), 0.0, R)
-        middle = R[2]
-        _stick_line(z, w, B, F, s, k, start, x1, L, line, t, 0.0, R)
-        if first + 4 * middle + R[2] > 0:
+        t, total = 0.5 * (left + right), 0.0
+        for i in range(_NODES.size):
+            part = start + _NODES[i] * (t - start)
+            _stick_line(z, w, B, F, s, k, start, x1, L, line, part, 0.0, R)
+            total += _WEIGHTS[i] * R[2]
+        if total > 0:
             left = t
         else:
             right = t
