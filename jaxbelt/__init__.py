@@ -26,8 +26,8 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     cycles/         chains settling shooting motions closure clocked followed periodic exponents
     cycles/         orbits cycle attractors functionals backwards returns separatrices portrait
     cycles/         unstable outlines nearest sides shocks
-    sweeps/         observers moments along reducers attractor strobes queue threads
-    sweeps/         runs_in_memory audit grid datasets question locks store progress work
+    sweeps/         observers moments along reducers attractor growth winding strobes queue
+    sweeps/         threads runs_in_memory audit grid datasets question locks store progress work
     sweeps/         clusters sweep shares
     sweeps/         naming forced_basins basins fractions orbit_diagram circle_map
     bifurcations/   special labels beside systems timed_systems guesses base conditions forced

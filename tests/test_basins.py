@@ -150,8 +150,9 @@ def test_two_cycles_with_one_sequence_of_events_are_two():
     periods = sorted(float(cycle.period) for cycle in found.cycles)
     assert periods == pytest.approx([9.9148027860, 10.9019400715], abs=1e-9)
     assert [name for name in found.attractors if name.startswith("cycle")] == [
-        "cycle that sticks to belt 0"
-    ] * 2
+        "cycle that sticks to belt 0 (1)",
+        "cycle that sticks to belt 0 (2)",
+    ]
 
 
 @pytest.mark.slow(first=True)
@@ -318,3 +319,17 @@ def test_a_checkerboard_and_more_than_two_labels():
 def test_impossible_boxes_of_an_entropy_are_named(side, message):
     with pytest.raises(ValueError, match=message):
         entropy_of(np.zeros((8, 6), int), side)
+
+
+@pytest.mark.slow(first=True)
+def test_two_attractors_of_one_kind_have_numbers():
+    """Two motions of one period that stick to one belt; each is drawn in the colour of its name."""
+    belt = jb.Belt(0.2, jb.Stribeck(0.4, 0.2, 0.1), 1.0)
+    forcing = (jb.Harmonic(0.109453140753, 0.9, 0.5), jb.BaseMotion(0.16, 0.9))
+    osc = jb.Oscillator(0.1, (belt,), forcing=forcing)
+    found = jb.basins(osc, x1=np.linspace(-1, 1, 9), x2=np.linspace(-0.8, 0.8, 9), t1=3000.0)
+    name = "1-periodic motion that sticks to belt 0"
+    assert found.attractors == (f"{name} (1)", f"{name} (2)")
+    assert abs(found.cycles[0].x1_max - found.cycles[1].x1_max) > 0.01
+    _, labels = found.plot().get_legend_handles_labels()
+    assert labels == [f"to {name} (1)", f"to {name} (2)", f"{name} (1)", f"{name} (2)"]

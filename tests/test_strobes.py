@@ -406,3 +406,74 @@ def test_a_mass_that_a_belt_carries_has_no_extrema(t):
     ends = (lanes.x1, 0.1 * h, -0.2 + 0 * h), (lanes.x1, -0.1 * h, -0.2 + 0 * h)
     cut = ForcedAttractor()._cut(seen, Course.of_step(*ends, h), begun + steps, ones)
     np.testing.assert_allclose(cut, 0.5, atol=1e-3)
+
+
+def weakly_forced(frequency, amplitude, damping=0.05):
+    """A stick-slip cycle that is pushed."""
+    law = jb.Conti(static=1.0, residual=0.6, steepness=10.0)
+    forcing = jb.Harmonic(amplitude, frequency)
+    return jb.Oscillator(damping, (jb.Belt(0.2, law),), forcing=forcing)
+
+
+def maxima_of(osc, start, t0, t1):
+    """Times of the maxima of x1 between t0 and t1, by a run of `simulate`."""
+    ts = np.linspace(t0, t1, 1 + round(100 * (t1 - t0)))
+    x2 = np.asarray(jb.simulate(osc, start, t1, ts=ts).ys[:, 1])
+    before = np.flatnonzero((x2[:-1] > 0) & (x2[1:] <= 0))
+    share = x2[before] / (x2[before] - x2[before + 1])
+    return ts[before] + share * (ts[before + 1] - ts[before])
+
+
+@pytest.mark.slow(first=True)
+def test_winding_numbers_of_stick_slip_motions_that_are_pushed():
+    """Hardly pushed, the mass moves as without forcing; locked to the force, it has a rational
+    winding number, which is that of the motion; else the mean of the maxima is between bounds."""
+    axes = {"frequency": [0.5, 1.141, 1.7], "amplitude": [1e-4, 0.02, 0.2]}
+    found = jb.sweep(weakly_forced, axes, y0=(0.5, 0.1), t1=20_000.0, observe="attractor")
+    kinds = jb.decoded(found).kind.values
+    assert np.all(kinds[:, :2] == "quasiperiodic")
+    assert np.all(found.status.values[:, :2] == Status.OK)
+    pushed = weakly_forced(1.0, 1.0)
+    alone = jb.find_cycle(jb.Oscillator(pushed.damping, pushed.belts), (0.5, 0.1))
+    expected = 2 * np.pi / (np.asarray(axes["frequency"]) * float(alone.period))
+    np.testing.assert_allclose(found.winding.values[:, 0], expected, rtol=1e-6)
+
+    for row in range(3):
+        osc = weakly_forced(axes["frequency"][row], 0.02)
+        times = maxima_of(osc, (0.5, 0.1), 1000.0, 3000.0)
+        k = np.arange(1, len(times))
+        periods = (times[1:] - times[0]) / (2 * np.pi / axes["frequency"][row])
+        low, high = np.max(np.floor(periods) / k), np.min(np.ceil(periods) / k)
+        assert high - low < 1e-3 and low <= 1 / found.winding.values[row, 1] <= high
+
+
+@pytest.mark.slow(first=True)
+def test_the_winding_number_of_a_periodic_motion_counts_its_maxima():
+    """Also where one of them is at a strobe, before or behind it by rounding."""
+    found = jb.sweep(
+        weakly_forced,
+        {"frequency": [0.8, 1.2, 2.6], "amplitude": [0.3, 0.35]},
+        y0=(0.5, 0.1),
+        observe="attractor",
+    )
+    seen = 0
+    for at in np.ndindex(3, 2):
+        row = found.isel(frequency=at[0], amplitude=at[1])
+        if jb.decoded(row).kind != "periodic":
+            continue
+        seen += 1
+        osc = weakly_forced(float(row.frequency), float(row.amplitude))
+        motion = jb.find_cycle(osc, (0.5, 0.1))
+        loops = len(maxima_of(osc, motion.starts[0], 0.0, float(motion.period)))
+        np.testing.assert_allclose(row.winding * row.periods, loops, rtol=1e-12)
+    assert seen >= 3
+
+    def response(phase):
+        """x1 is largest at t = 0, and x2 there is rounding."""
+        law = jb.Coulomb(1.0, 1.0)
+        forcing = jb.Harmonic(0.5, 2.0, phase)
+        return jb.Oscillator(0.2, (jb.Belt(1.0, law, 0.0),), forcing=forcing)
+
+    phases = np.arctan2(0.2 * 2.0, 1 - 2.0**2) + np.array([-1e-15, 0.0, 1e-15])
+    row = jb.sweep(response, {"phase": phases}, y0=(0.0, 0.0), observe="attractor")
+    np.testing.assert_array_equal(row.winding, 1.0)

@@ -39,8 +39,8 @@ VARIABLES = {
 VARIABLES_FORCED = {
     "attractor": (
         *("kind", "periods", "sticks", "period", "stick_duration", "x1_min", "x1_max"),
-        *("x2_min", "x2_max", "x1_strobe", "x2_strobe", "exponent", "exponent_error"),
-        *("transient", "n_events", "status"),
+        *("x2_min", "x2_max", "winding", "x1_strobe", "x2_strobe", "exponent"),
+        *("exponent_error", "transient", "n_events", "status"),
     ),
     "final": VARIABLES["final"],
     "lyapunov": ("exponent", "exponent_error", "n_events", "status"),

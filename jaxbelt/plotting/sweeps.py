@@ -187,22 +187,26 @@ def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:
     require_axes(ax)
     ax = new_axes() if ax is None else ax
     labels = np.asarray(basins.label)
-    x1, x2 = np.asarray(basins.dataset["x1"]), np.asarray(basins.dataset["x2"])
+    x1s, x2s = np.asarray(basins.dataset["x1"]), np.asarray(basins.dataset["x2"])
     colours = _basin_colours(basins.attractors)
     palette = matplotlib.colors.ListedColormap(["white", *colours])
-    mesh = ax.pcolormesh(x1, x2, labels.T, cmap=palette, vmin=-1.5, vmax=len(colours) - 0.5)
+    mesh = ax.pcolormesh(x1s, x2s, labels.T, cmap=palette, vmin=-1.5, vmax=len(colours) - 0.5)
     mesh.set_rasterized(True)
-    limits: dict[str, Any] = dict(xlim=(x1[0], x1[-1]), ylim=(x2[0], x2[-1]))
+    limits: dict[str, Any] = dict(xlim=(x1s[0], x1s[-1]), ylim=(x2s[0], x2s[-1]))
     ax.set(**limits)
     for colour, name in zip(colours, basins.attractors, strict=True):
         ax.add_patch(Rectangle((0, 0), 0, 0, facecolor=colour, edgecolor="0.4", label=f"to {name}"))
     cycles = [c for c in (*basins.cycles, basins.boundary) if c is not None and int(c.status) == 0]
     if basins.boundary is None:
-        motions = [one for one in cycles if isinstance(one, PeriodicMotion)]
-        for motion, mark in zip(motions, cycle("osD^v"), strict=False):
-            style: dict[str, Any] = {"marker": mark, "mec": "black", "mfc": "white", "ls": "none"}
-            states = np.asarray(motion.starts)
-            ax.plot(*states.T, **style, label=f"{len(states)}-periodic")
+        names = [name for name in basins.attractors if is_cycle(name)]
+        marks = zip(basins.cycles, names, cycle("osD^v"), strict=False)
+        for motion, name, mark in marks:
+            assert isinstance(motion, PeriodicMotion)
+            x1, x2 = np.asarray(motion.starts).T
+            seen = (x1 >= x1s[0]) & (x1 <= x1s[-1]) & (x2 >= x2s[0]) & (x2 <= x2s[-1])
+            if np.any(seen):
+                # Those that are found attract: filled.
+                ax.plot(x1, x2, marker=mark, color="black", ls="none", label=name)
         label_plane(ax)
         ax.set(**limits)
     else:

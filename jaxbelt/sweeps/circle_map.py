@@ -43,8 +43,8 @@ from ..motion.simulate import SIMULATION_TOLERANCE, simulate
 from ..numerics.compiling import jit, power_of_two, where_any
 from ..results import Status, draw
 from ..tables import table_of
+from .growth import Growth, course_of_step, delay_of_event, grown, grown_past
 from .runs_in_memory import results_from
-from .strobes import Growth, course_of_step, delay_of_event, grown, grown_past
 
 if TYPE_CHECKING:
     import pandas

@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections import Counter
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -11,8 +12,8 @@ from ..cycles.attractors import is_same
 from ..cycles.cycle import Cycle
 from ..cycles.periodic import PeriodicMotion, is_same_motion
 
-#: Where the mass rests, at the end of the words for an attractor.
-REST = re.compile(r"(?<=rest.at.)-?\d+(\.\d+)?(e[+-]\d+)?$")
+#: Where the mass rests, at the end of the words for an attractor, or before its number.
+REST = re.compile(r"(?<=rest.at.)-?\d+(\.\d+)?(e[+-]\d+)?(?=(.\(\d+\))?$)")
 
 
 class Found(NamedTuple):
@@ -50,7 +51,18 @@ def told_apart(kinds: np.ndarray, of_run: Callable[[tuple[int, ...]], Found]) ->
             found.append(one._replace(runs=same))
         else:
             before.runs[same] = True
-    return sorted(found, key=lambda one: -int(np.sum(one.runs)))
+    return _numbered(sorted(found, key=lambda one: -int(np.sum(one.runs))))
+
+
+def _numbered(found: list[Found]) -> list[Found]:
+    """Attractors with a number behind the name where several have the same one."""
+    times = Counter(one.name for one in found)
+    seen: Counter[str] = Counter()
+    for i, one in enumerate(found):
+        seen[one.name] += 1
+        if times[one.name] > 1:
+            found[i] = one._replace(name=f"{one.name} ({seen[one.name]})")
+    return found
 
 
 def words_for(kind: str, sticks: np.ndarray, x1: float, length: float) -> str:

@@ -32,10 +32,11 @@ from .along import Along
 from .attractor import Attractor
 from .datasets import DIMENSIONS_OF_STARTS, Table, variable_of
 from .grid import Grid
+from .growth import LargestExponent
 from .moments import AtEvents, checked
 from .observers import Final, Reduce
 from .reducers import check_reducer
-from .strobes import ForcedAttractor, LargestExponent
+from .strobes import ForcedAttractor
 
 if TYPE_CHECKING:
     import xarray

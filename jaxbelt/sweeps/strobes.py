@@ -1,17 +1,9 @@
-"""Observers of forced runs that look once in each period of the forcing: labels and exponents.
+"""Labels of what forced runs lead to, by a look once in each period of the forcing.
 
 At these moments, the strobes, everything that knows the time is as it was a period before: a motion
 repeats if its state at a strobe is that at an earlier one. `ForcedAttractor` looks for such repeats
-and ends a run as soon as it knows one; `LargestExponent` goes on to the end of the run. Both carry
-a tangent along, from whose growth the largest Lyapunov exponent follows:
-
-- along a slip arc a tangent d solves d1' = d2, d2' = -d1 + c(t) d2 with c the derivative of x2' by
-  x2. Each half step is made by the exponential of Magnus's series of order four, with c at its ends
-  and in its middle; the trace of the matrix leaves the exponential and is added to the logarithm.
-- at an event d jumps by the saltation of the guard h that fires: d_tau = -(h_x d) / (h_t + h_x f-),
-  d+ = d + (f- - f+) d_tau, with the fields f before and behind. Behind a stick phase d2 = 0.
-
-Magnus's series: S. Blanes, F. Casas, J. A. Oteo, J. Ros, Physics Reports 470, 2009, 151, sec. 5.
+and ends a run as soon as it knows one. Where there is none until the end of the run, its largest
+exponent decides.
 """
 
 from collections.abc import Mapping
@@ -19,24 +11,22 @@ from dataclasses import replace
 from typing import ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from ..cycles.clocked import RATIO_ROUNDING, RATIOS
-from ..cycles.exponents import BLOCKS
 from ..cycles.settling import way_left
-from ..kernel.clocked import of_lanes, rate_of_stick
-from ..kernel.lanes import Lanes, Observer, Passage, Variable, choose, in_few, materialise
-from ..model.instants import blur, field_at, guards_at
-from ..model.modes import Mode, any_of, mode_acceleration, select
-from ..model.oscillator import at_time, frequencies
+from ..kernel.lanes import Lanes, Observer, Variable, choose, materialise
+from ..model.instants import blur
+from ..model.oscillator import frequencies
 from ..model.own_units import OwnOscillator
 from ..numerics.implicit import step_to_root
 from ..results import Status
 from .attractor import EQUILIBRIUM, STUCK_FOR_EVER, UNDECIDED, Attractor
+from .growth import UNMEASURED, Growth, course_of_step, grown, grown_past
 from .moments import LEAST_CUT, Course
+from .winding import Winding
 
 #: Kinds of attractors of forced oscillators, in the order of their codes.
 FORCED_KINDS = ("undecided", "equilibrium", "periodic", "stuck", "quasiperiodic", "chaotic")
@@ -65,8 +55,6 @@ CONFIRMED = 16
 APART, APART_OF_ERRORS = 10.0, 1000.0
 #: Strobes after which a state is no longer waited for at first; then twice as many, and so on.
 FIRST_PATIENCE = 8
-#: Share of a run before its exponent is measured.
-UNMEASURED = 0.25
 #: Standard errors within which an exponent is zero; per period the error of its computation, and
 #: how large both may be together where a motion is quasiperiodic.
 DEVIATIONS, COMPUTED, RESOLVED = 3.0, 1e-12, 0.01
@@ -109,20 +97,21 @@ class _Repeats(eqx.Module):
 class _Extent(eqx.Module):
     """What is known of the motion since the state of `_Repeats`, arrays [lanes].
 
-    low, high: least and largest (x1, x2); sticks: time stuck to each belt; events: their number at
-    the beginning; top: the strobe with the largest x1, (x1, x2).
+    low, high: least and largest (x1, x2); sticks: time stuck to each belt; events, rises: their
+    numbers at the beginning; top: the strobe with the largest x1, (x1, x2).
     """
 
     low: tuple[Array, Array]
     high: tuple[Array, Array]
     sticks: tuple[Array, ...]
     events: Array
+    rises: Array
     top: tuple[Array, Array]
 
     @classmethod
-    def none(cls, lanes: Lanes, belts: int) -> "_Extent":
+    def none(cls, lanes: Lanes, belts: int, rises: Array) -> "_Extent":
         zero, state = jnp.zeros_like(lanes.t), (lanes.x1, lanes.x2)
-        return cls(state, state, (zero,) * belts, lanes.events, (zero - jnp.inf, zero))
+        return cls(state, state, (zero,) * belts, lanes.events, rises, (zero - jnp.inf, zero))
 
     def with_point(self, x1: Array, x2: Array) -> "_Extent":
         lows = zip(self.low, (x1, x2), strict=True)
@@ -132,64 +121,13 @@ class _Extent(eqx.Module):
         return replace(self, low=low, high=high)
 
 
-class Growth(eqx.Module):
-    """The tangent and the logarithms of its growth, arrays [lanes].
-
-    d1, d2: the tangent, of size one when it was last looked at; log: its growth by then; since,
-    before: the time at which the present block began, and `log` there; began: the time at which the
-    run did; blocks: how many are done, -1 before the first; total, squares: sums of the rates of
-    growth in them, and of their squares; sticks: whether the mass stuck since the first began.
-    """
-
-    d1: Array
-    d2: Array
-    log: Array
-    since: Array
-    before: Array
-    began: Array
-    blocks: Array
-    total: Array
-    squares: Array
-    sticks: Array
-
-    @classmethod
-    def none(cls, lanes: Lanes) -> "Growth":
-        zero = jnp.zeros_like(lanes.t)
-        return cls(
-            d1=zero + np.cos(1.0),
-            d2=zero + np.sin(1.0),
-            log=zero,
-            since=lanes.t,
-            before=zero,
-            began=lanes.t,
-            blocks=jnp.full_like(lanes.events, -1),
-            total=zero,
-            squares=zero,
-            sticks=zero > 0,
-        )
-
-    @property
-    def size(self) -> Array:
-        """The logarithm of the tangent's growth until now; -inf where it has vanished."""
-        return self.log + jnp.log(jnp.hypot(self.d1, self.d2))
-
-    def exponent(self) -> tuple[Array, Array]:
-        """The largest exponent per unit of time, and its standard error; NaN without blocks."""
-        count = self.blocks.astype(self.total.dtype)
-        safe = jnp.maximum(count, 2.0)  # one block has no spread
-        mean = self.total / safe
-        spread = jnp.maximum(self.squares / safe - mean * mean, 0.0) / (safe - 1)
-        known = count >= 2
-        return jnp.where(known, mean, jnp.nan), jnp.where(known, jnp.sqrt(spread), jnp.nan)
-
-
 class _RunSoFar(eqx.Module):
     """Memory of the observers, arrays [lanes].
 
     strobes: number of the next strobe, counted from t = 0; turns: of the first force from one to
     the next, 0: the frequencies have no period in common. farthest: largest distance from the
-    origin in each half of the time in which exponents are measured. kind, periods, loop_events: of
-    the attractor, once known; transient: the time when it was.
+    origin in each half of the time in which exponents are measured. kind, periods, loop_events,
+    loop_rises: of the attractor, once known; transient: the time when it was.
     """
 
     strobes: Array
@@ -198,42 +136,12 @@ class _RunSoFar(eqx.Module):
     extent: _Extent
     farthest: tuple[Array, Array]
     growth: Growth
+    winding: Winding
     kind: Array
     periods: Array
     loop_events: Array
+    loop_rises: Array
     transient: Array
-
-
-class LargestExponent(Observer):
-    """The largest Lyapunov exponent of a forced run, over its last three quarters."""
-
-    variables: ClassVar[Mapping[str, Variable]] = {
-        "exponent": Variable("largest Lyapunov exponent per unit of time", dimension="rate"),
-        "exponent_error": Variable("its standard error", dimension="rate"),
-        "n_events": Variable("number of events", "int32"),
-    }
-
-    def start(self, osc, lanes):
-        return Growth.none(lanes)
-
-    def follow(self, take_step, osc, window, ones, lanes, t1, rtol, atol):
-        new = take_step(osc, window, ones, lanes, t1, rtol, atol)
-        course = course_of_step(osc, lanes, new, ones)
-        growth = grown(osc, lanes.memory, lanes, course, course.duration, ones)
-        return replace(new, memory=growth)
-
-    def watch(self, osc, lanes, passage, ones, t1, tol):
-        return replace(lanes, memory=grown_past(osc, lanes.memory, lanes, passage, t1))
-
-    def finish(self, osc, lanes):
-        exponent, error = lanes.memory.exponent()
-        good = lanes.status == Status.OK.value
-        return {
-            "exponent": jnp.where(good, exponent, jnp.nan),
-            "exponent_error": jnp.where(good, error, jnp.nan),
-            "n_events": lanes.events,
-            "status": lanes.status,
-        }
 
 
 class ForcedAttractor(Observer):
@@ -247,14 +155,16 @@ class ForcedAttractor(Observer):
     - Stuck for ever, or at rest on an edge that pushes back from both sides at all times.
     - Where no repeat is found until the end of the run its largest exponent decides: it is chaotic
       where that is more than three standard errors above zero, quasiperiodic where it is zero
-      within these, the mass never sticks and nothing seems to repeat, and else undecided, with the
-      status NOT_SETTLED; so is a motion that still grows or shrinks.
+      within these, nothing seems to repeat, and the mass never sticks or the maxima of x1 keep
+      their order on the circle of phases. Else it is undecided, with the status NOT_SETTLED; so is
+      a motion that still grows or shrinks.
     """
 
     variables: ClassVar[Mapping[str, Variable]] = {
         "kind": Variable("what the run leads to", "int8", meanings=dict(enumerate(FORCED_KINDS))),
         "periods": Variable("periods of the forcing until the motion repeats", "int32"),
         **{name: Attractor.variables[name] for name in OF_LOOPS_AND_MOTIONS},
+        "winding": Variable("maxima of x1 in a period of the forcing, on average"),
         "x1_strobe": Variable("displacement at the strobe where it is largest", dimension="length"),
         "x2_strobe": Variable("velocity at that strobe", dimension="velocity"),
         "exponent": Variable(
@@ -274,16 +184,19 @@ class ForcedAttractor(Observer):
         patience = count + FIRST_PATIENCE
         far = zero + jnp.inf
         repeats = _Repeats(nowhere, nowhere, never, patience, count, count, zero, zero, far)
+        winding = Winding.none(lanes)
         return _RunSoFar(
             strobes=(passed + 1).astype(count.dtype),
             turns=turns,
             repeats=repeats,
-            extent=_Extent.none(lanes, len(osc.belts)),
+            extent=_Extent.none(lanes, len(osc.belts), winding.rises_begun),
             farthest=(zero, zero),
             growth=Growth.none(lanes),
+            winding=winding,
             kind=count,
             periods=count,
             loop_events=count,
+            loop_rises=count,
             transient=nowhere,
         )
 
@@ -304,6 +217,10 @@ class ForcedAttractor(Observer):
         going_on = seen.kind == UNDECIDED
         extent = self._extended(seen.extent, lanes, new, course)
         seen = replace(seen, growth=growth, extent=choose(going_on & ~cut, extent, seen.extent))
+        first_at = growth.began + UNMEASURED * (t1 - growth.began)
+        period = _strobe_period(osc, seen.turns)
+        winding = seen.winding.followed(lanes, new, course, first_at, period, ones)
+        seen = replace(seen, winding=choose(going_on & ~cut, winding, seen.winding))
         share = (new.t - growth.began) / (t1 - growth.began)
         second = share >= 0.5 * (1 + UNMEASURED)
         halves = (share >= UNMEASURED) & ~second, second
@@ -411,7 +328,8 @@ class ForcedAttractor(Observer):
             nearest=jnp.where(fresh, jnp.inf, nearest),
         )
         found = found & due
-        empty = _Extent.none(lanes, len(extent.sticks))
+        rises = seen.winding.rises_begun
+        empty = _Extent.none(lanes, len(extent.sticks), rises)
         empty = replace(empty, top=(x1, x2))
         kept = choose(fresh & ~found, empty, extent)
         return replace(
@@ -420,6 +338,7 @@ class ForcedAttractor(Observer):
             repeats=choose(due, repeats, known),
             extent=choose(due, kept, seen.extent),
             loop_events=jnp.where(found, lanes.events - extent.events, seen.loop_events),
+            loop_rises=jnp.where(found, rises - extent.rises, seen.loop_rises),
             kind=jnp.where(found, kind, seen.kind).astype(seen.kind.dtype),
             periods=jnp.where(found, known.n, seen.periods).astype(seen.periods.dtype),
             transient=jnp.where(found, lanes.t, seen.transient),
@@ -454,7 +373,9 @@ class ForcedAttractor(Observer):
         growth_seen = (1 - UNMEASURED) * (lanes.t - growth.began) * exponent
         chaotic = resolved & (exponent > doubt) & (growth_seen >= GROWTH_OF_CHAOS)
         chaotic = chaotic & (high - low <= STEADY_CHAOS * high)
-        even = resolved & (jnp.abs(exponent) <= doubt) & (doubt * once < RESOLVED) & ~growth.sticks
+        ordered = seen.winding.is_ordered & (seen.turns > 0)
+        even = resolved & (jnp.abs(exponent) <= doubt) & (doubt * once < RESOLVED)
+        even = even & (~growth.sticks | ordered)
         even = even & (seen.repeats.n == 0) & (high - low <= STEADY * high)
         kind = jnp.where(chaotic, CHAOTIC, jnp.where(even, QUASIPERIODIC, seen.kind))
         kind = jnp.where(neutral, UNDECIDED, kind)
@@ -462,7 +383,9 @@ class ForcedAttractor(Observer):
         status = jnp.where(lost, Status.NOT_SETTLED.value, lanes.status)
         neutral = neutral & (lanes.status == Status.OK.value)
         status = jnp.where(neutral, Status.NEUTRAL.value, status)
-        period = seen.periods.astype(lanes.t.dtype) * once
+        periods, rises = (one.astype(lanes.t.dtype) for one in (seen.periods, seen.loop_rises))
+        period, loops = periods * once, rises / jnp.maximum(periods, 1.0)
+        wound = seen.winding.number(ordered)
         repeats, holds = kind == PERIODIC, kind == STUCK_FOR_EVER
         rests = holds | (kind == EQUILIBRIUM)
 
@@ -481,6 +404,7 @@ class ForcedAttractor(Observer):
             "x1_max": of_attractor(extent.high[0], lanes.x1),
             "x2_min": of_attractor(extent.low[1], lanes.x2),
             "x2_max": of_attractor(extent.high[1], lanes.x2),
+            "winding": jnp.where(kind > STUCK_FOR_EVER, wound, of_attractor(loops, 0.0)),
             "x1_strobe": of_attractor(extent.top[0], lanes.x1),
             "x2_strobe": of_attractor(extent.top[1], lanes.x2),
             "exponent": jnp.where(open_, exponent, jnp.nan),
@@ -491,29 +415,16 @@ class ForcedAttractor(Observer):
         }
 
 
-def course_of_step(osc: OwnOscillator, lanes: Lanes, new: Lanes, ones: Array) -> Course:
-    """The way of lanes in a step."""
-    ends = [(one.x1, one.x2, _x2_slope(osc, lanes.mode, one)) for one in (lanes, new)]
-    return Course.of_step(ends[0], ends[1], materialise(new.t - lanes.t, ones))
-
-
-def _x2_slope(osc: OwnOscillator, mode: Mode, lanes: Lanes) -> Array:
-    """x2' of the lanes in a mode; their `a`, where the mass sticks, is what belts have to hold."""
-    rate = rate_of_stick(at_time(osc, lanes.t), mode)
-    return jnp.where(mode.any_stuck, rate, lanes.a)
-
-
 def _common_turns(osc: OwnOscillator, none: Array) -> Array:
     """As `turns_of`, of each lane, as numbers like `none`, its 0 where there is no such period."""
-    first, *others = frequencies(osc)
-    turns = none
-    for m in reversed(range(1, RATIOS + 1)):
-        whole = jnp.ones(none.shape, bool)
-        for other in others:
-            ratio = jnp.abs(m * other / first)
-            whole = whole & (jnp.abs(ratio - jnp.round(ratio)) <= RATIO_ROUNDING * ratio)
-        turns = jnp.where(whole, m, turns)
-    return turns.astype(none.dtype)
+    first, *others = (jnp.broadcast_to(one, none.shape)[..., None] for one in frequencies(osc))
+    turns = jnp.arange(1, RATIOS + 1, dtype=first.dtype).reshape((1,) * none.ndim + (RATIOS,))
+    whole = jnp.ones((*none.shape, RATIOS), bool)
+    for other in others:
+        ratio = jnp.abs(turns * other / first)
+        whole = whole & (jnp.abs(ratio - jnp.round(ratio)) <= RATIO_ROUNDING * ratio)
+    smallest = 1 + jnp.argmax(whole, axis=-1)
+    return jnp.where(jnp.any(whole, axis=-1), smallest, 0).astype(none.dtype)
 
 
 def _strobe_period(osc: OwnOscillator, turns: Array) -> Array:
@@ -526,105 +437,3 @@ def _way_to_zero(value: Array, slope: Array, h: Array) -> Array:
     """Time to where a value vanishes, 0 where that is farther than `NEAR_EXTREMUM`."""
     way = step_to_root(value, slope)
     return jnp.where((jnp.abs(way) <= NEAR_EXTREMUM) & (h > 0), way, 0.0)
-
-
-# --- tangents -------------------------------------------------------------------------------------
-
-
-def grown(osc, growth: Growth, lanes: Lanes, course: Course, h: Array, ones) -> Growth:
-    """The tangent after a step of size h; along a slip arc the trace of the field is taken into the
-    logarithm."""
-    mode, d1, d2, log = lanes.mode, growth.d1, growth.d2, growth.log
-    along = jnp.where(mode.any_stuck, 0.0, h)
-    rates = []
-    for k in range(5):
-        now = at_time(osc, lanes.t + 0.25 * k * along)
-        x2 = course.velocity(jnp.full_like(h, 0.25 * k))[0]
-
-        def field(x2, now=now):
-            return mode_acceleration(now, mode, lanes.x1, x2)
-
-        rates.append(materialise(jax.jvp(field, (x2,), (jnp.ones_like(x2),))[1], ones))
-    half = 0.5 * along
-    for start, middle, end in (rates[:3], rates[2:]):
-        mean, change = (start + 4 * middle + end) / 6, end - start
-        # Omega = half (0, 1; -1, mean) - half^2 / 12 change (0, 1; 1, 0), without half its trace.
-        twist = half * half * change / 12
-        p, q, r = -0.5 * half * mean, half - twist, -half - twist
-        square = p * p + q * r
-        even, odd = jnp.ones_like(square), jnp.ones_like(square)
-        for k in reversed(range(1, 9)):
-            even = 1 + square * even / ((2 * k - 1) * (2 * k))
-            odd = 1 + square * odd / (2 * k * (2 * k + 1))
-        d1, d2 = even * d1 + odd * (p * d1 + q * d2), even * d2 + odd * (r * d1 - p * d2)
-        log = log + 0.5 * half * mean
-    return replace(growth, d1=materialise(d1, ones), d2=materialise(d2, ones), log=log)
-
-
-def grown_past(osc, growth: Growth, lanes: Lanes, passage: Passage, t1: Array) -> Growth:
-    """The tangent behind the events that were passed, and its growth until now."""
-    n, tangent = len(osc.belts), (growth.d1, growth.d2)
-    busy = lanes.run >= 0
-    fired, released = passage.fired & busy, passage.released & busy
-
-    def jumped(osc, passage, state, mode, fired, released, before):
-        first = passage.before, passage.mode, passage.number
-        d = of_lanes(_saltation, osc, *first, (passage.x1, passage.x2, passage.t), before)
-        d = select(fired, d, before)
-        upward = any_of([stuck & (code > 0) for stuck, code in zip(passage.mode.stuck, mode.codes)])
-        number = jnp.where(upward, 3 * n + 1, 3 * n)
-        return select(released, of_lanes(_saltation, osc, passage.mode, mode, number, state, d), d)
-
-    args = passage, (lanes.x1, lanes.x2, lanes.t), lanes.mode, fired, released, tangent
-    d1, d2 = in_few(fired | released, jumped, (osc, *args), tangent)
-    sticks = growth.sticks | passage.mode.any_stuck | lanes.mode.any_stuck
-    growth = replace(growth, d1=d1, d2=d2, sticks=sticks)
-    return _counted(growth, lanes.t, t1)
-
-
-def _counted(growth: Growth, t: Array, t1: Array) -> Growth:
-    """The tangent of size one, its growth in the logarithm, and the block ended that is over."""
-    size = jnp.hypot(growth.d1, growth.d2)
-    size = jnp.where((size > 0) & jnp.isfinite(size), size, 1.0)
-    log = growth.log + jnp.log(size)
-    first = growth.began + UNMEASURED * (t1 - growth.began)
-    length = (t1 - first) / BLOCKS
-    over = t >= first + (growth.blocks + 1).astype(t.dtype) * length - 1e-9 * length
-    elapsed = t - growth.since
-    counts = over & (growth.blocks >= 0) & (elapsed > 0)
-    rate = jnp.where(counts, (log - growth.before) / jnp.where(counts, elapsed, 1.0), 0.0)
-    return replace(
-        growth,
-        d1=growth.d1 / size,
-        d2=growth.d2 / size,
-        log=log,
-        since=jnp.where(over, t, growth.since),
-        before=jnp.where(over, log, growth.before),
-        blocks=jnp.where(over & (growth.blocks < BLOCKS), growth.blocks + 1, growth.blocks).astype(
-            growth.blocks.dtype
-        ),
-        total=growth.total + rate,
-        squares=growth.squares + rate * rate,
-        sticks=growth.sticks & ~(over & (growth.blocks < 0)),
-    )
-
-
-def _saltation(osc: OwnOscillator, before: Mode, after: Mode, number: Array, y, d):
-    """The tangent behind an event, of scalars: the guard of that number fired at the state y."""
-    entry, exit_ = field_at(osc, before, y), field_at(osc, after, y)
-    late = delay_of_event(osc, before, number, y, d)
-    d1 = d[0] + (entry[0] - exit_[0]) * late
-    d2 = d[1] + (entry[1] - exit_[1]) * late
-    return d1, jnp.where(after.any_stuck, 0.0, d2)
-
-
-def delay_of_event(osc: OwnOscillator, before: Mode, number: Array, y, d) -> Array:
-    """How much later, for a tangent d, the guard of that number fires; 0 where it is touched."""
-
-    def guard(*y):
-        guards = guards_at(osc, before, y)
-        return jnp.sum(jnp.where(jnp.arange(guards.size) == number.astype(int), guards, 0.0))
-
-    _, moved = jax.jvp(guard, y, (*d, jnp.zeros_like(d[0])))
-    _, slope = jax.jvp(guard, y, field_at(osc, before, y))
-    return step_to_root(moved, slope)

@@ -83,9 +83,10 @@ def sweep(
       Of oscillators that are forced: kind (periodic, stuck, equilibrium; and, where no period is
       found until t1, chaotic, quasiperiodic or undecided by the largest exponent), periods (of the
       forcing, until the motion repeats), sticks(belt), period, stick_duration(belt) and the extrema
-      in it, x1_strobe and x2_strobe (its state at the phase 0 where x1 is largest, a guess for
-      `periodic`), exponent and exponent_error (where no period is found), transient, n_events; see
-      `strobes.ForcedAttractor`. Without a period NaN stands for what belongs to one.
+      in it, winding (maxima of x1 in a period of the forcing, on average), x1_strobe and x2_strobe
+      (its state at the phase 0 where x1 is largest, a guess for `periodic`), exponent and
+      exponent_error (where no period is found), transient, n_events; see `strobes.ForcedAttractor`.
+      Without a period NaN stands for what belongs to one.
     - `"lyapunov"`, of oscillators that are forced: exponent, the largest Lyapunov exponent per unit
       of time, from the last three quarters of the run, exponent_error, its standard error from 25
       parts of these, n_events.

@@ -1,0 +1,107 @@
+"""Winding numbers of forced runs: how many maxima of x1 there are in a period of the forcing.
+
+Where the phases of successive maxima follow one another as by a map of the circle that preserves
+their order, the k-th maximum comes D periods after the first with floor(D)/k <= r <= ceil(D)/k, r
+the mean number of periods between maxima. All these bounds together leave an interval whose ends
+are the neighbours of r among the fractions with denominators up to the number of maxima: between
+them there is no fraction with a smaller denominator than theirs. Bounds that contradict each other
+show that the order is not kept, as in chaos.
+
+A. Katok, B. Hasselblatt, Introduction to the Modern Theory of Dynamical Systems, 1995, sec. 11.1.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ..kernel.lanes import Lanes, materialise
+from ..numerics.implicit import step_to_root
+from .moments import Course
+
+#: Periods between two maxima are a whole number up to this, which the times of maxima err.
+WHOLE = 1e-7
+#: So many maxima are looked at, at least; a motion whose order is kept repeats after no fewer than
+#: one in so many of them, or never.
+FEWEST_MAXIMA, PARTS_OF_MAXIMA = 256, 16
+#: Newton's steps to the time of a maximum within a step.
+STEPS_TO_MAXIMUM = 3
+
+
+class Winding(eqx.Module):
+    """The maxima of x1 of a run, and the bounds of the periods between them, arrays [lanes].
+
+    rises: whether x2 was positive last; maxima: how many there were; began, first: the time of the
+    one from which bounds are counted, NaN before it, and its number; latest: periods from it to the
+    latest one; low, high: bounds of the mean number of periods between two; low_after, high_after:
+    the number of maxima after which they were first known, which is the denominator.
+    """
+
+    rises: Array
+    maxima: Array
+    began: Array
+    first: Array
+    latest: Array
+    low: Array
+    high: Array
+    low_after: Array
+    high_after: Array
+
+    @classmethod
+    def none(cls, lanes: Lanes) -> "Winding":
+        zero, count = jnp.zeros_like(lanes.t), jnp.zeros_like(lanes.events)
+        nan, inf = zero + jnp.nan, zero + jnp.inf
+        return cls(lanes.x2 > 0, count, nan, count, zero, zero, inf, count, count)
+
+    def followed(
+        self, lanes: Lanes, new: Lanes, course: Course, first_at: Array, period: Array, ones: Array
+    ) -> "Winding":
+        """With a step; bounds are counted from the first maximum at `first_at` or later on."""
+        here = self.rises & (new.x2 <= 0)
+        maxima = self.maxima + here.astype(self.maxima.dtype)
+        fall = lanes.x2 - new.x2
+        theta = jnp.where(fall > 0, lanes.x2 / jnp.where(fall > 0, fall, 1.0), 1.0)
+        for _ in range(STEPS_TO_MAXIMUM):
+            theta = jnp.clip(theta + step_to_root(*course.velocity(theta)), 0.0, 1.0)
+        t = materialise(lanes.t + theta * course.duration, ones)
+        starts = here & jnp.isnan(self.began) & (t >= first_at)
+        counts = here & ~jnp.isnan(self.began)
+        k = maxima - self.first
+        safe = jnp.where(counts, k, 1).astype(t.dtype)
+        periods = jnp.where(counts, (t - self.began) / period, 0.0)
+        low, high = jnp.floor(periods + WHOLE) / safe, jnp.ceil(periods - WHOLE) / safe
+        above, below = counts & (low > self.low), counts & (high < self.high)
+        return Winding(
+            rises=new.x2 > 0,
+            maxima=maxima,
+            began=jnp.where(starts, t, self.began),
+            first=jnp.where(starts, maxima, self.first),
+            latest=jnp.where(counts, periods, self.latest),
+            low=jnp.where(above, low, self.low),
+            high=jnp.where(below, high, self.high),
+            low_after=jnp.where(above, k, self.low_after),
+            high_after=jnp.where(below, k, self.high_after),
+        )
+
+    @property
+    def rises_begun(self) -> Array:
+        """How often x1 has begun to rise: as often in each period of a motion that repeats, though
+        rounding decides whether a maximum at a strobe is before or behind it."""
+        return self.maxima + self.rises.astype(self.maxima.dtype)
+
+    @property
+    def is_ordered(self) -> Array:
+        """Whether the maxima keep their order and repeat after many of them only, or never."""
+        count = self.maxima - self.first
+        repeats_after = jnp.minimum(self.low_after, self.high_after)
+        return (
+            (count >= FEWEST_MAXIMA)
+            & (self.low <= self.high)
+            & (repeats_after * PARTS_OF_MAXIMA >= count)
+        )
+
+    def number(self, ordered: Array) -> Array:
+        """Maxima in a period: by the bounds where they are ordered, else the mean of the run."""
+        count = (self.maxima - self.first).astype(self.low.dtype)
+        between = 0.5 * (self.low + self.high) * count
+        periods = jnp.where(ordered, between, self.latest)
+        return jnp.where(periods > 0, count / jnp.where(periods > 0, periods, 1.0), jnp.nan)
