@@ -79,8 +79,9 @@ ADVICE = {
     Status.NOT_SETTLED: (
         "No loop of the orbit repeated within the budget of arcs: it approaches its attractor very "
         "slowly, or, where damping is negative, grows beyond all bounds. Start nearer to the "
-        "cycle, or move away from the bifurcation point. With forcing it may be chaotic (see "
-        "jb.lyapunov), or grow at resonance where nothing damps it."
+        "cycle, or move away from the bifurcation point. With forcing it may be chaotic or "
+        "quasi-periodic (see jb.lyapunov), repeat after more than the 16 periods of jb.find_cycle "
+        "(labels of jb.sweep know longer ones), or grow at resonance where nothing damps it."
     ),
     Status.TOO_MANY_ARCS: "A loop has more arcs than there is room for: pass a larger max_arcs.",
     Status.NO_CONVERGENCE: (

@@ -18,12 +18,15 @@ from .activity import announced
 from .bifurcations.base import BifurcationPoint
 from .bifurcations.curves import BifurcationCurve
 from .bifurcations.diagrams import BifurcationDiagram
+from .bifurcations.regions import RegionMap
 from .checks import in_words, outside_of_traces, require, require_one_of
 from .cycles.cycle import Cycle
+from .cycles.exponents import Exponents
 from .cycles.functionals import energy_dissipated
 from .cycles.periodic import PeriodicMotion
 from .cycles.portrait import Portrait
 from .cycles.shocks import FatalShock
+from .inverse.design import Design
 from .inverse.fit import Fit
 from .model.equilibria import Equilibria
 from .model.instants import field_at
@@ -34,6 +37,7 @@ from .model.parameters import names_of, unit_of
 from .motion.simulate import Trajectory
 from .results import EventKind, Status
 from .sweeps.basins import Basins, BasinStability
+from .sweeps.circle_map import CircleMap
 from .sweeps.datasets import flags
 from .sweeps.fractions import BasinFractions
 from .sweeps.naming import rest_in_m
@@ -57,6 +61,12 @@ INSTEAD = {
     BifurcationCurve: "; its values are in the units of the arguments where a function was given, "
     "else multiply them by machine.units.velocity, say",
     Equilibria: "; write jb.in_si(jb.portrait(osc), machine), which has them among its rows",
+    RegionMap: "; its values are in the units of the arguments of its function: draw it by its own "
+    ".plot()",
+    CircleMap: "; its phases have no unit: draw it by its own .plot(), and for a motion write "
+    "jb.in_si(found.motions[0], machine)",
+    Exponents: "; multiply its values by machine.units.rate",
+    Design: "; write machine.of_oscillator(plan.oscillator)",
 }
 
 

@@ -103,6 +103,24 @@ def test_a_trajectory_of_another_machine(run):
     assert alone.identical(whole.drop_vars("force"))
 
 
+@pytest.mark.parametrize(
+    ("kind", "advice"),
+    [
+        (jb.RegionMap, "draw it by its own"),
+        (jb.CircleMap, r"jb.in_si\(found.motions\[0\], machine\)"),
+        (jb.Exponents, "multiply its values by machine.units.rate"),
+        (jb.Design, r"write machine.of_oscillator\(plan.oscillator\)"),
+    ],
+)
+def test_what_is_not_converted_has_advice(kind, advice):
+    result = object.__new__(kind)
+    with pytest.raises(TypeError, match=f"got {kind.__name__}; .*{advice}"):
+        jb.in_si(result, machine())
+    if kind in (jb.RegionMap, jb.CircleMap):
+        with pytest.raises(ValueError, match=f"got a {kind.__name__}; .*{advice}"):
+            jb.plot_in_si(result, machine)
+
+
 @pytest.mark.slow(first=True)
 def test_a_portrait_and_a_shock_in_si():
     """Of one that was put together by hand; a cycle and an equilibrium are real ones."""

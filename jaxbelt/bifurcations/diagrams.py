@@ -136,7 +136,7 @@ class BifurcationDiagram(eqx.Module):
         ends = ", ".join(f"{value:.6g}" for value in self.open_ends)
         return (
             f"BifurcationDiagram({self.name}, {len(self.points)} points, "
-            f"{len(self.branches)} branches, regions {names}"
+            f"{len(self.branches)} branches{f', regions {names}' if names else ''}"
             f"{f', not followed beyond {ends}' if ends else ''})"
         )
 

@@ -84,7 +84,7 @@ def turns_of(osc: Oscillator) -> int:
     common = all(
         abs(float(ratio) - one) <= RATIO_ROUNDING * one and ratio > 0 for ratio, one in pairs
     )
-    require(common, "osc", "such that all its frequencies have a period in common", found)
+    require(common, "osc", "such that all its frequencies have a period in common", found.tolist())
     return math.lcm(*(ratio.denominator for ratio in ratios))
 
 

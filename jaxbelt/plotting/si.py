@@ -18,10 +18,12 @@ from matplotlib.transforms import Affine2D, Bbox, Transform
 
 from ..bifurcations.base import BifurcationPoint
 from ..bifurcations.diagrams import BifurcationDiagram
+from ..bifurcations.regions import RegionMap
 from ..checks import require
 from ..cycles.functionals import MEASURED_IN
 from ..model.machine import SI_UNITS, Units
-from ..si import AlongParameter, check_machine, units_along, units_of
+from ..si import INSTEAD, AlongParameter, check_machine, units_along, units_of
+from ..sweeps.circle_map import CircleMap
 from ..sweeps.naming import rest_in_m
 from .diagrams import QUANTITIES
 from .draw import draw_result
@@ -76,6 +78,9 @@ def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any
             impossible.
     """
     require_axes(ax)
+    is_without = isinstance(result, RegionMap | CircleMap)
+    came = f"a {type(result).__name__}{INSTEAD.get(type(result), '')}"
+    require(not is_without, "result", "one with a dimension in its picture", came)
     units, parameter = _units_of_picture(result, machine)
     is_list = isinstance(result, Sequence | np.ndarray)
     several = is_list and all(isinstance(one, Axes) for one in result)
