@@ -408,11 +408,16 @@ def spread(case, noise, mine):
     Times count as distances, at the speed at which each event's line was approached. Returns the
     two largest distances and the disturbed runs.
     """
-    runs = [case.simulate(noise=noise, seed=seed) for seed in range(compare.DISTURBED)]
+    runs = [_disturbed(case, noise, seed, mine) for seed in range(compare.DISTURBED)]
     alike = [r for r in runs if r.sequence == mine.sequence and r.status == mine.status]
     far = max((np.max(np.abs(np.subtract(r.y_end, mine.y_end))) for r in alike), default=0.0)
     rows = max((_away(r.t, r.y, mine) for r in alike), default=0.0)
     return far, rows, runs
+
+
+def _disturbed(case, noise, seed, mine):
+    """A disturbed run, with room for twice the events of the one that is not."""
+    return case.simulate(noise=noise, seed=seed, max_events=max(20_000, 2 * len(mine.t)))
 
 
 def _away(t, y, mine):
@@ -487,7 +492,7 @@ def _of_disturbed_runs(case, told, mine, tol):
     others = []
     for seed in range(compare.DISTURBED):
         for noise in (tol, 10 * tol):
-            other = case.simulate(noise=noise, seed=seed)
+            other = _disturbed(case, noise, seed, mine)
             if other.sequence != mine.sequence or other.status != mine.status:
                 if difference(case, told, other, 10 * noise) is None:
                     return True
@@ -495,7 +500,7 @@ def _of_disturbed_runs(case, told, mine, tol):
     if not others:
         return False
     for seed in range(compare.DISTURBED, 4 * compare.DISTURBED):
-        other = case.simulate(noise=tol, seed=seed)
+        other = _disturbed(case, tol, seed, mine)
         if difference(case, told, other, 10 * tol) is None:
             return True
         others.append(other)
