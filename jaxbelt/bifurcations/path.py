@@ -16,7 +16,7 @@ parameter leads.
 """
 
 import functools
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -286,15 +286,16 @@ class ParameterPath:
                 or AttractingCycle((), loops[-1])
             )
         self.cycles[value] = found
-        self._name(value, rests, courses)
+        self.labels[value] = Label(rests, (), (), courses, not self.basins or bool(seen.bounded))
+        self._name(value)
 
-    def _name(self, value: float, rests, courses: tuple[Hashable, ...]) -> None:
+    def _name(self, value: float) -> None:
+        """The label at a value with its cycles."""
         cycles = sorted(self.cycles[value], key=lambda one: one.path)
         loops, osc = [one.loop for one in cycles if one.path], self.at(value)
         marks = tuple(condition.mark(osc, loops) for condition in self.conditions)
-        bounded = not self.basins or bool(is_bounded(osc))
         paths = tuple(one.path for one in cycles)
-        self.labels[value] = Label(rests, paths, marks, courses, bounded)
+        self.labels[value] = self.labels[value]._replace(cycles=paths, marks=marks)
 
     def _attracting_cycle(
         self, value: float, loop: Loop, *, closes: bool = True
@@ -333,7 +334,7 @@ class ParameterPath:
                         path = itinerary(self.at(b), one.loop, LEAST_MOMENT)
                         if path in known:
                             others[i] = one._replace(path=path)
-                            self._name(b, self.labels[b].equilibria, self.labels[b].courses)
+                            self._name(b)
 
     def _share(self) -> None:
         """Adds attracting cycles that a neighbouring value has.
@@ -387,7 +388,7 @@ class ParameterPath:
             # Replaces a cycle that was only assumed.
             at = 0 if others and not others[0].path else len(others)
             others[at : at + 1] = [found]
-            self._name(value, self.labels[value].equilibria, self.labels[value].courses)
+            self._name(value)
         return at
 
     def strands(self, values: Sequence[float]) -> list[dict[float, Loop]]:
@@ -494,7 +495,8 @@ def _fits(loop: Loop, other: Loop) -> bool:
 
 
 class _Motions(NamedTuple):
-    """Equilibria, [rows], and for every orbit its status and last loop, [starts, ROOM]."""
+    """Equilibria, [rows], for every orbit its status and last loop, [starts, ROOM], and whether
+    loops far out shrink."""
 
     kind: Any
     stable: Any
@@ -503,6 +505,7 @@ class _Motions(NamedTuple):
     x1_upper: Any
     status: Any
     loop: Any
+    bounded: Any
 
 
 @jit
@@ -511,6 +514,6 @@ def _motions(oscs: Oscillator, stride: ArrayLike) -> _Motions:
         rests = candidates(osc)
         loop, status = repeated_loops(osc, rests, ROOM, stride)
         known = (rests.kind, rests.stable, rests.modes, rests.x1_lower, rests.x1_upper)
-        return _Motions(*known, status, loop)
+        return _Motions(*known, status, loop, is_bounded(osc))
 
     return each(at)(oscs)

@@ -43,6 +43,21 @@ class Family(eqx.Module):
             leaves[place] = jnp.asarray(sum(moves, start=one.asarray(leaf)))
         return jax.tree.unflatten(structure, leaves)
 
+    def rows(self, values: np.ndarray) -> Oscillator:
+        """Those at many known values, [rows, k], as one with a row in each leaf; as `at`."""
+        leaves, structure = jax.tree.flatten(self.oscillator)
+        shifts = (values - np.asarray(self.origin)).T
+        for place, (leaf, slope) in enumerate(zip(leaves, self.slopes, strict=True)):
+            if not eqx.is_array(leaf):
+                continue
+            made = np.broadcast_to(np.asarray(leaf), (len(values), *leaf.shape))
+            if slope is not None and np.any(slope):
+                columns = shifts.reshape(*shifts.shape, *(1,) * leaf.ndim)
+                pairs = zip(np.asarray(slope), columns, strict=True)
+                made = sum((np.where(row == 0, 0.0, row * by) for row, by in pairs), start=made)
+            leaves[place] = jnp.asarray(made)
+        return jax.tree.unflatten(structure, leaves)
+
     @property
     def units(self) -> Any:
         """By how much each parameter changes where that number of the oscillator which changes

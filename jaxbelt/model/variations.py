@@ -216,17 +216,9 @@ class Variation:
 
     def oscillators(self, rows: np.ndarray) -> Oscillator:
         """Those at many values, [rows, k], as one with a row in each leaf."""
-        line = self.line
-        if line is None:
+        if self.line is None:
             return eqx.filter_vmap(self.make)(*(jnp.asarray(column) for column in rows.T))
-        # In NumPy, which compiles nothing.
-        made = [line.at(row) for row in rows]
-        return jax.tree.map(
-            lambda *of_rows: (
-                jnp.asarray(np.stack(of_rows)) if eqx.is_array(of_rows[0]) else of_rows[0]
-            ),
-            *made,
-        )
+        return self.line.rows(rows)
 
     def coincidences(self, first: float, last: float) -> dict[float, list[tuple[int, ...]]]:
         """Where, between two values of the one parameter, belts come to run at one velocity, two
