@@ -714,6 +714,8 @@ def test_impossible_parameters_are_named(build, message):
         ({"ts": jnp.array([2.0, 1.0])}, "ts must be increasing"),
         ({"formulation": "exact"}, "formulation must be .* got 'exact'"),
         ({"formulation": "switch", "v_star": 0.0}, "v_star must be > 0, got 0"),
+        ({"v_star": 0.1}, 'v_star must be left out unless formulation="switch", got 0.1'),
+        ({"formulation": "switch", "eps": 0.1}, 'eps must be left out unless formulation="smooth"'),
         ({"formulation": "smooth", "eps": -1.0}, "eps must be > 0, got -1"),
         ({"max_segments": 0}, "max_segments must be a positive integer, got 0"),
     ],

@@ -1,5 +1,6 @@
 """`jaxbelt orbits`: an orbit diagram, the points of attractors along a parameter."""
 
+import math
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -124,5 +125,7 @@ def parse_start(text: str) -> tuple[float, float]:
     try:
         x1, x2 = map(float, text.split(","))
     except ValueError:
-        raise ValueError(f"also must be X1,X2, two numbers, got {text!r}") from None
+        x1 = x2 = math.nan
+    if not math.isfinite(x1 + x2):
+        raise ValueError(f"also must be X1,X2, two finite numbers, got {text!r}")
     return x1, x2

@@ -47,10 +47,10 @@ def simulate(
     ] = "filippov",
     v_star: Annotated[
         float | None,
-        option("Half-width of the switch model's band, a velocity.", "0.001, dimensionless"),
+        option("Half-width of the switch model's band, a velocity.", "1e-3 of its own size"),
     ] = None,
     eps: Annotated[
-        float | None, option("Width of the smooth model's tanh, likewise.", "0.001, dimensionless")
+        float | None, option("Width of the smooth model's tanh, likewise.", "1e-3 of its own size")
     ] = None,
     tolerance: Annotated[float | None, tolerance_of("1e-10")] = None,
     out: Out = Path("trajectory"),
@@ -131,8 +131,13 @@ def simulate(
         described.check()
         y0, machine = described.start(start), described.machine
         end = 100.0 if t1 is None else described.dimensionless(t1, "time")
-        for name, width in (("v_star", v_star), ("eps", eps)):
-            asked[name] = 1e-3 if width is None else described.dimensionless(width, "velocity")
+        for name, width, of in (("v-star", v_star, "switch"), ("eps", eps, "smooth")):
+            if width is not None:
+                check_number(name, width)
+                if formulation != of:
+                    raise ValueError(f"{name} must be left out unless --formulation is {of}")
+                width = described.dimensionless(width, "velocity")
+            asked[name.replace("-", "_")] = width
         turn_on_float64()
         import numpy as np
 

@@ -352,7 +352,7 @@ def simulate(
             `own_units`.
         formulation: "filippov", "switch" or "smooth".
         v_star: Half-width of the switch model's band, a velocity; None: 1e-3 of the oscillator's
-            own.
+            own. For the formulation "switch" alone.
         eps: Width of the smooth formulation, likewise.
         max_segments: Budget of arcs; None chooses one from the time span. A run that uses it up
             returns what it has, with the status TOO_MANY_SEGMENTS. A loop behind a stick phase that
@@ -384,6 +384,9 @@ def simulate(
         '"filippov", "switch" or "smooth"',
         repr(formulation),
     )
+    for name, width, of in (("v_star", v_star, "switch"), ("eps", eps, "smooth")):
+        expected = f'left out unless formulation="{of}"'
+        require(width is None or formulation == of, name, expected, width)
     padded = not is_concrete((osc, y0, t0, t1, ts, rtol, atol))
     ends_at_t1 = ts is None or (
         is_concrete((ts, t1)) and np.size(ts) > 0 and bool(np.asarray(ts)[-1] == t1)
