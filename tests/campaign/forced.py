@@ -731,19 +731,28 @@ def _slip_root(z, w, B, F, s, L, line, order, shift, t, x1, x2, a, right, f_left
 @njit(nogil=True, cache=True, error_model="numpy")
 def _slip_root_beside(z, w, B, F, s, L, line, t, x1, x2, a, right, V, K):
     """As `_stick_root_beside`; the length and the state there."""
-    left, end = 0.0, right
+    left, end, h = 0.0, right, right
     for _ in range(60):
-        h, total = 0.5 * (left + right), 0.0
+        mean = 0.0
         for i in range(_NODES.size):
             part = _NODES[i] * h
             y1, y2 = _advance(z, w, B, F, s, t, x1, x2, a, part, V, K)
             _, slope, _ = _slip_line(z, w, B, F, s, L, line, t + part, y1, y2, K[_N])
-            total += _WEIGHTS[i] * slope
-        if total > 0:
+            mean += _WEIGHTS[i] * slope
+        if mean > 0:
             left = h
         else:
             right = h
-    h = min(max(right, 1e-11 * _blur(t)), end)
+        # The mean is g / h.
+        y1, y2 = _advance(z, w, B, F, s, t, x1, x2, a, h, V, K)
+        _, slope, _ = _slip_line(z, w, B, F, s, L, line, t + h, y1, y2, K[_N])
+        new = h - h * mean / (slope - mean) if slope < mean else 0.0
+        if not (left < new < right):
+            new = 0.5 * (left + right)
+        if abs(new - h) <= 1e-16:
+            break
+        h = new
+    h = min(max(h, 1e-11 * _blur(t)), end)
     y1, y2 = _advance(z, w, B, F, s, t, x1, x2, a, h, V, K)
     return h, y1, y2
 
@@ -867,18 +876,26 @@ def _stick_root_beside(z, w, B, F, s, k, start, x1, L, line, right, R):
 
     All its values in between are rounding; its mean slope, which also vanishes there, is not.
     """
-    left, end = start, right
+    left, end, t = start, right, right
     for _ in range(60):
-        t, total = 0.5 * (left + right), 0.0
+        mean = 0.0
         for i in range(_NODES.size):
             part = start + _NODES[i] * (t - start)
             _stick_line(z, w, B, F, s, k, start, x1, L, line, part, 0.0, R)
-            total += _WEIGHTS[i] * R[2]
-        if total > 0:
+            mean += _WEIGHTS[i] * R[2]
+        if mean > 0:
             left = t
         else:
             right = t
-    return min(max(right, start + 1e-11 * _blur(start)), end)
+        # The mean is g / (t - start).
+        _stick_line(z, w, B, F, s, k, start, x1, L, line, t, 0.0, R)
+        new = t - (t - start) * mean / (R[2] - mean) if R[2] < mean else start
+        if not (left < new < right):
+            new = 0.5 * (left + right)
+        if new == t or new == left or new == right:
+            break
+        t = new
+    return min(max(t, start + 1e-11 * _blur(start)), end)
 
 
 # ---------------------------------------------------------------- transitions
