@@ -51,10 +51,10 @@ def told_apart(kinds: np.ndarray, of_run: Callable[[tuple[int, ...]], Found]) ->
             found.append(one._replace(runs=same))
         else:
             before.runs[same] = True
-    return _numbered(sorted(found, key=lambda one: -int(np.sum(one.runs))))
+    return _with_numbers(sorted(found, key=lambda one: -int(np.sum(one.runs))))
 
 
-def _numbered(found: list[Found]) -> list[Found]:
+def _with_numbers(found: list[Found]) -> list[Found]:
     """Attractors with a number behind the name where several have the same one."""
     times = Counter(one.name for one in found)
     seen: Counter[str] = Counter()
