@@ -28,7 +28,7 @@ CAMPAIGNS = {
         name: name
         for name in (
             *("paths", "refine", "portraits", "shocks", "fractions", "maps", "steep"),
-            *("coverage", "slopes", "branches", "curves", "designs"),
+            *("coverage", "slopes", "branches", "curves", "designs", "multipliers"),
         )
     },
     "forced-sweep": "forced_sweeps",
@@ -40,7 +40,9 @@ RUNS = PLAIN | {"threads", "extreme_share", "heavy", "regime", "structure", "tol
 KNOWN = {
     **dict.fromkeys(("paths", "refine", "portraits", "shocks"), PLAIN),
     "maps": frozenset(),
-    **dict.fromkeys(("steep", "coverage", "slopes", "branches", "curves", "designs"), PLAIN),
+    **dict.fromkeys(
+        ("steep", "coverage", "slopes", "branches", "curves", "designs", "multipliers"), PLAIN
+    ),
     "fractions": PLAIN | {"threads"},
     "forced-sweep": PLAIN | {"threads", "structure", "tol"},
     "forced": PLAIN | {"threads", "structure", "tol"},
