@@ -51,7 +51,7 @@ from ..numerics.compiling import where_any
 from ..numerics.control_points import Polynomial, highest_difference, passage, through
 from ..results import Status
 from .holds import NEEDED_ROUNDING, FirstEnd, hold_from, is_steady
-from .lanes import Lanes, Passage, choose, in_few, materialise
+from .lanes import Lanes, Passage, in_few, materialise
 from .rounds import lanes_in
 from .step import (
     LANDING,
@@ -64,8 +64,10 @@ from .step import (
     as_quotient,
     combine,
     first_step,
+    integrated,
     next_size,
     nystroem,
+    shortened_or_landed,
 )
 from .waves import StepClock, StepWave
 
@@ -475,10 +477,7 @@ def take_timed_step(
     t = jnp.where(ends_hold, lanes.until, t)
     pace, proposed = next_size(lanes, new, going, accepted)
     proposed = jnp.where(window.stuck & accepted, 4 * h, proposed)
-    stands = shortened & (theta * h < NO_STEP)
-    proposed = jnp.where(shortened, theta * h, proposed)
-    proposed = jnp.where(stands, NO_STEP, proposed)
-    proposed = jnp.where(lands | stands, -proposed, proposed)
+    proposed, stands = shortened_or_landed(proposed, shortened, theta * h, lands)
     return replace(
         lanes,
         t=jnp.where(kept, t, lanes.t),
@@ -488,17 +487,8 @@ def take_timed_step(
         h=lax.stop_gradient(jnp.where(going, proposed, lanes.h)),
         pace=lax.stop_gradient(jnp.where(accepted & ~window.stuck, pace, lanes.pace)),
         hit=jnp.where(lands | stands, number, lanes.hit).astype(lanes.hit.dtype),
-        integrals=_timed_integrated(rates, osc, lanes, new, delta, x1, x2, kept) if rates else None,
+        integrals=integrated(rates, osc, lanes, new, delta, x1, x2, kept) if rates else None,
     )
-
-
-def _timed_integrated(rates, osc, lanes: Lanes, new: _TimedAttempt, delta, x1, x2, kept) -> Any:
-    """The integrals after a step and the Taylor step behind it."""
-    t = lanes.t + new.h
-    ends = [(t, new.x1, new.x2), (t + delta, x1, x2)]
-    slopes = [rates(osc, lanes.mode, *end) for end in ends]
-    totals = jax.tree.map(lambda i, *s: i + 0.5 * delta * sum(s), new.integrals, *slopes)
-    return choose(kept, totals, lanes.integrals)
 
 
 def pass_timed_events(

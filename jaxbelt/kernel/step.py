@@ -493,10 +493,7 @@ def take_step(
     delta, x1, x2 = _with_its_derivatives(moves, at.on_edge, delta, bound, new, (x1, x2, a_end))
     t = jnp.where(last & ~lands, t1, lanes.t + h + delta)
     pace, proposed = next_size(lanes, new, going, accepted)
-    stands = shortened & (at.theta * h < NO_STEP)
-    proposed = jnp.where(shortened, at.theta * h, proposed)
-    proposed = jnp.where(stands, NO_STEP, proposed)
-    proposed = jnp.where(lands | stands, -proposed, proposed)
+    proposed, _ = shortened_or_landed(proposed, shortened, at.theta * h, lands)
     lower, upper = lanes.lower, lanes.upper
     if window.extrema is not None:
         extremum = jnp.where(path.has_extremum, path.x2_extremum, x2)
@@ -512,7 +509,7 @@ def take_step(
         pace=lax.stop_gradient(jnp.where(accepted, pace, lanes.pace)),
         lower=lower,
         upper=upper,
-        integrals=_integrated(rates, osc, lanes, new, delta, x1, x2, kept) if rates else None,
+        integrals=integrated(rates, osc, lanes, new, delta, x1, x2, kept) if rates else None,
     )
 
 
@@ -547,7 +544,7 @@ def _(primals, tangents):
     return (delta, x1, x2), (late, d_x1, d_x2)
 
 
-def _integrated(rates, osc, lanes: Lanes, new: _Attempt, delta, x1, x2, kept) -> Any:
+def integrated(rates, osc, lanes: Lanes, new: Any, delta, x1, x2, kept) -> Any:
     """The integrals after a step and the Taylor step behind it."""
     t = lanes.t + new.h
     ends = [(t, new.x1, new.x2), (t + delta, x1, x2)]
@@ -568,6 +565,15 @@ def next_size(lanes: Lanes, new: Any, going, accepted) -> tuple[Array, Array]:
     # Towards a boundary the law bends more and more: a step that had to shrink will have to again.
     trend = jnp.where(accepted, jnp.maximum(pace, lanes.pace) / lanes.pace, 1.0)
     return pace, jnp.minimum(STEP_SAFETY / (pace * trend), LONGEST_STEP)
+
+
+def shortened_or_landed(proposed, shortened, shorter, lands) -> tuple[Array, Array]:
+    """The size of the next step where one was shortened; negative of lanes that have landed, or
+    stand on a bound at once; and which these last ones are."""
+    stands = shortened & (shorter < NO_STEP)
+    proposed = jnp.where(shortened, shorter, proposed)
+    proposed = jnp.where(stands, NO_STEP, proposed)
+    return jnp.where(lands | stands, -proposed, proposed), stands
 
 
 def first_step(rtol):
