@@ -39,7 +39,7 @@ from ..cycles.attractors import (
     without_idle,
 )
 from ..cycles.chains import SIZES, Loop, cut
-from ..cycles.cycle import Cycle, as_loop, cycle_from, polish
+from ..cycles.cycle import Cycle, as_loop, cycle_from, exactly, polish
 from ..cycles.orbits import FINE_STRIDE
 from ..cycles.settling import AT_REST
 from ..cycles.unstable import among_all, from_starts
@@ -65,6 +65,8 @@ CLOSE = 1e-6
 #: Fraction of a step along the path by which the derivative of a cycle is taken, but no less than
 #: CLOSE: a cycle that hardly attracts is known to 1e-5 of its size only.
 DIFFERENCE = 1e-3
+#: Unstable cycles are searched at one in so many values of a stretch, and followed in between.
+FOLLOWED_VALUES = 8
 #: A cycle is at its expected place if it is no farther from there than this, relative to its size,
 #: or than a third of its expected move. Closer to a square root, intervals get smaller.
 EXPECTED = 1e-3
@@ -145,13 +147,18 @@ class ParameterPath:
         return self.unstable_cycles[value, around]
 
     def unstable_along(self, values: Sequence[float] | np.ndarray, around: int) -> list[Cycle]:
-        """Unstable cycles at values in order.
+        """Unstable cycles at values in order, between which nothing else happens.
 
-        Starts near the equilibrium may lead to none, or pass over it to one farther out; there the
-        cycles at neighbouring values are continued.
+        They are searched at some of the values, and followed from one of these to the next, where
+        the cycle has to be the one that is searched; else all are searched. Starts near the
+        equilibrium may lead to none, or pass over it to one farther out; there the cycles at
+        neighbouring values are continued.
         """
         order = [float(value) for value in values]
         known = self.unstable_cycles
+        searched = sorted({*range(0, len(order), FOLLOWED_VALUES), len(order) - 1})
+        for first, last in pairwise(searched):
+            self._follow_unstable(order[first : last + 1], around)
         if not any(_is_found(self.unstable(value, around)) for value in order):
             middle = order[len(order) // 2]
             if (middle, around) not in self._searched:
@@ -165,6 +172,22 @@ class ParameterPath:
                 if found is not None and _width(found) <= _width(one):
                     known[value, around] = found
         return [known[value, around] for value in order]
+
+    def _follow_unstable(self, order: Sequence[float], around: int) -> None:
+        """Follows the unstable cycle from the first value to those before the last one, if it is
+        found there and leads to the one that is found at the last."""
+        cycle, end = (self.unstable(value, around) for value in (order[0], order[-1]))
+        if not (_is_found(cycle) and _is_found(end)):
+            return
+        followed: dict[tuple[float, int], Cycle] = {}
+        for value in order[1:]:
+            found = _gone_on(self.at(value), cycle)
+            if found is None:
+                return
+            cycle = followed[value, around] = found
+        if distance(place_of(cycle), place_of(end)) < SAME_CYCLE:
+            for key, one in followed.items():
+                self.unstable_cycles.setdefault(key, one)
 
     def beside(self, value: float, *, slow: bool = False) -> tuple[float, float]:
         """The values just below and just above; farther off where motions converge slowly."""
@@ -451,7 +474,7 @@ def _is_found(cycle: Cycle) -> bool:
 def _gone_on(osc: Oscillator, beside: Cycle) -> Cycle | None:
     """The cycle that an unstable cycle at a neighbouring value continues to."""
     loop = jax.tree.map(np.asarray, as_loop(beside, ROOM))
-    cycle = polish(osc, cut([loop])[0], jnp.asarray(Status.OK.value))
+    cycle = exactly(osc, cut([loop])[0], jnp.asarray(Status.OK.value))
     return cycle if _is_beside(beside, cycle) and float(cycle.multiplier) > 1 else None
 
 
