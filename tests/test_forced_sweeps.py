@@ -153,3 +153,22 @@ def test_an_orbit_diagram_has_the_periods_of_find_cycle():
         points = np.sort(x1[0][np.isfinite(x1[0])])
         np.testing.assert_allclose(points, np.sort(motion.starts[:, 0]), atol=1e-5)
     assert {"cycle", "no period found"} == set(diagram.kind.ravel().tolist())
+
+
+@pytest.mark.parametrize("x2", [-9.184850993605148e-17, 0.0, -1e-12])
+def test_a_mass_on_an_edge_that_a_belt_just_begins_to_carry(x2):
+    """The belt is at rest at t = 0 up to rounding, as cos(3 pi / 2) is, and the other belt touches
+    behind the edge. Such a run stood still there, and ended with TOO_MANY_STEPS."""
+    phase = 4.71238898038469
+
+    def make(damping):
+        swings = jb.Belt(jb.Oscillating(0.0, 0.5, 0.5, phase), jb.Coulomb(0.8, 0.4), upper=0.0)
+        rests = jb.Belt(0.0, jb.Coulomb(0.8, 0.4), lower=-0.5)
+        forces = (jb.Harmonic(0.8, 0.5, np.pi / 2), jb.Harmonic(1.6, 0.5, phase))
+        return jb.Oscillator(damping, (swings, rests), forcing=forces)
+
+    found = jb.sweep(make, {"damping": [0.1]}, y0=(-0.5, x2), t1=1.0, observe="final")
+    assert found.status[0] == jb.Status.OK
+    # The belt carries it: x2 = sin(t / 2) / 2.
+    np.testing.assert_allclose(found.x1_end[0], -0.5 + 1 - np.cos(0.5), atol=1e-10)
+    np.testing.assert_allclose(found.x2_end[0], 0.5 * np.sin(0.5), atol=1e-10)
