@@ -655,3 +655,33 @@ def test_what_is_for_forced_oscillators_says_so():
     osc = jb.Oscillator(0.0, (jb.Belt(1.0, law),), forcing=forces)
     with pytest.raises(ValueError, match="a period in common"):
         jb.find_cycle(osc, (0.0, 0.0))
+
+
+@pytest.mark.slow(first=True)
+def test_no_motion_begins_a_stick_phase_off_its_belt():
+    """Newton's method came to arcs that close, of which the first one sticks, as the guess's orbit
+    did at the phase 0, though x2 is 0.106 less than the belt's velocity there."""
+    belts = (
+        jb.Belt(
+            0.4154444398169099,
+            jb.Conti(0.6049188829626094, 0.2550394743834081, 6.02933669528854),
+            0.79044996904765,
+            lower=-0.8422993400111707,
+        ),
+        jb.Belt(
+            0.6418290706066099,
+            jb.Conti(1.2035373653805785, 0.8721736605049802, 5.413125720158654),
+            1.3703185331281773,
+            lower=0.36749594123280493,
+        ),
+    )
+    forcing = jb.Harmonic(0.26103804975329814, 2.093961775249448, 1.109664635677639)
+    osc = jb.Oscillator(0.3919753302448578, belts, forcing=forcing)
+    guess = (1.404863563013945, 0.5510750911554423)
+    motion = jb.periodic(osc, guess, periods=2)
+    if motion.status == jb.Status.OK:
+        run = jb.simulate(osc, motion.start, motion.period, ts=[float(motion.period)])
+        np.testing.assert_allclose(run.ys[-1], motion.start, atol=1e-8)
+    # What it was, is none.
+    wrong = jnp.array([1.36221451, 0.30946912])
+    assert motion.status != jb.Status.OK or jnp.max(jnp.abs(motion.start - wrong)) > 1e-3

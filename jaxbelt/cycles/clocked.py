@@ -26,7 +26,7 @@ from jaxtyping import Array
 
 from ..checks import require
 from ..model.instants import carried, guards_at, guards_trend, trend_of
-from ..model.modes import capacity, mode_acceleration, mode_of, select
+from ..model.modes import capacity, mode_acceleration, mode_of, select, stick_velocity
 from ..model.oscillator import Oscillator, at_time, frequencies
 from ..motion.arcs import Ends
 from ..motion.integrators import density
@@ -469,11 +469,15 @@ def _guard_slope(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
 
 def timed_admissible(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
     """Whether the oscillator moves along a solution of the equations: no arc leaves its mode before
-    its end, or comes back to it there, and none crosses a boundary where the mass would stick."""
+    its end, or comes back to it there, none crosses a boundary where the mass would stick, and
+    each stick phase begins on its belt, also where a period begins in one."""
     n = len(osc.belts)
 
     def one(osc, codes, mesh, end, after, unknown):
         y, duration = unknown[:3], unknown[3]
+        speed = osc.omega * y[1]
+        belt = stick_velocity(at_time(osc, y[2]), mode_of(codes), speed)
+        on_belt = jnp.abs(belt - speed) <= TOUCHES_AGAIN * (1 + jnp.abs(belt))
         end_state = flow(osc, codes, mesh, y, duration)
         now = at_time(osc, end_state[2])
         flips = codes * after == -1
@@ -483,7 +487,8 @@ def timed_admissible(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
         would_stick = crosses & (needed < capacity(now, held) - TOUCHES_AGAIN)
         least = least_guard(osc, codes, mesh, y, duration)
         late = _guard_slope(osc, codes, end, end_state) > COMES_BACK
-        return (duration >= -HOLDS) & (least >= -TOUCHES_AGAIN) & ~late & ~would_stick
+        stays = on_belt & (duration >= -HOLDS) & (least >= -TOUCHES_AGAIN)
+        return stays & ~late & ~would_stick
 
     columns = chain.codes, chain.mesh, chain.ends, following_codes(chain), z
     each = arc_by_arc(one)((osc,), columns)

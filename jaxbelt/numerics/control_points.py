@@ -141,9 +141,9 @@ def _passage(curve: Polynomial, doubt, rounding, trust, keep) -> RootPassage:
     # Newton's method may come to the root at 0 that began the way.
     there = jnp.where(dips, theta, jnp.maximum(theta, 0.1 * root))
     there = jnp.where(passes, jnp.minimum(root, theta), there)
-    # What is not above zero, and falls from the beginning, passes it there: of the way to where it
-    # is below by more than rounding less and less would be left.
-    there = jnp.where(once & (points[0] <= 0) & ~seen_rise, 0.0, there)
+    # What is below zero by rounding, and falls from the beginning, passes it there: of the way to
+    # where it is below by more, less and less would be left.
+    there = jnp.where(once & (points[0] < 0) & ~seen_rise, 0.0, there)
     return RootPassage(once, passes | splits | unclear, jnp.where(unclear, 0.5, there))
 
 
