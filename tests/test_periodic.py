@@ -109,7 +109,9 @@ def test_the_number_of_periods_beside_a_period_doubling_is_the_least():
     assert {motion.periods for motion in other.cycles} == {1}
     assert own.values.max() < float(point.value)
     assert other.values[[0, -1]] == pytest.approx(span, abs=1e-12)
-    assert np.array_equal(other.stable, other.values > float(point.value))
+    # At the point itself rounding decides.
+    beside = np.abs(other.values - float(point.value)) > 1e-9
+    assert np.array_equal(other.stable[beside], other.values[beside] > float(point.value))
 
 
 @pytest.mark.slow
