@@ -164,7 +164,7 @@ class Along(Observer):
         return self._asked_in_step(osc, ones, lanes, new, (h > 0) & ~cut, cuts)
 
     def _asked_in_step(self, osc, ones, lanes: Lanes, new: Lanes, kept, cuts: list[Cut]) -> Lanes:
-        seen, sides = new.memory, []
+        seen, sides, found = new.memory, [], []
         parts = zip(self._sections(), seen.sides, cuts, strict=True)
         for (number, direction, function), side, cut in parts:
             now = _seen(function, osc, new, new.x1, new.x2)
@@ -176,8 +176,15 @@ class Along(Observer):
                 delta = _to_section(function, osc, near, delta, lanes.t - near.t, new.t - near.t)
                 delta = materialise(delta, ones)
             wanted = (now != side) & (now * direction >= 0)
-            seen = self._ask(seen, osc, near, delta, wanted, number)
+            time = jnp.where(wanted, lax.stop_gradient(near.t + delta), jnp.inf)
+            found.append((time, jnp.full_like(lanes.events, number), cut.at_start, delta))
             sides.append(now)
+        for _ in found:
+            # One section may be crossed near the start, and another one near the end.
+            time, number, at_start, delta = functools.reduce(_sooner, found)
+            wanted = jnp.isfinite(time)
+            seen = self._ask(seen, osc, choose(at_start, lanes, new), delta, wanted, number)
+            found = [(jnp.where(one[1] == number, jnp.inf, one[0]), *one[1:]) for one in found]
         passed = []
         for (number, times), count in zip(self._times(), seen.passed, strict=True):
             due = kept & (new.t >= times.next_time(osc, count))
@@ -328,6 +335,12 @@ class Along(Observer):
         end = RunEnd(lanes.t, x1, x2, lanes.status, lanes.integrals)
         results = jax.vmap(self.reducer.finish)(lanes.memory.state, end)
         return {**results, "status": lanes.status}
+
+
+def _sooner(one: tuple[Array, ...], other: tuple[Array, ...]) -> tuple[Array, ...]:
+    """Of two moments, the times first, the one that is sooner in each lane."""
+    later = other[0] < one[0]
+    return tuple(jnp.where(later, b, a) for a, b in zip(one, other, strict=True))
 
 
 def _first(table: tuple[Array, ...]) -> Array:
