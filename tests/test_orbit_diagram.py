@@ -134,6 +134,7 @@ def test_a_loop_with_more_moments_than_there_is_room_for(monkeypatch):
     with_room = jb.orbit_diagram(*arguments, at=jb.AtEvents(), rows=4)
     assert with_room.x1.shape[-1] == 4
     monkeypatch.setattr(module, "MOMENTS_KEPT", 4)
+    monkeypatch.setattr(module, "PIECE_KEPT", 2)
     one_by_one = jb.orbit_diagram(*arguments, at=jb.AtEvents(), rows=4)
     for row in range(4):
         np.testing.assert_allclose(points(with_room, row), points(one_by_one, row), **CLOSE)
