@@ -177,7 +177,8 @@ class ParameterPath:
         """Follows the unstable cycle from the first value to those before the last one, if it is
         found there and leads to the one that is found at the last."""
         cycle, end = (self.unstable(value, around) for value in (order[0], order[-1]))
-        if not (_is_found(cycle) and _is_found(end)):
+        is_known = all((value, around) in self.unstable_cycles for value in order)
+        if is_known or not (_is_found(cycle) and _is_found(end)):
             return
         followed: dict[tuple[float, int], Cycle] = {}
         for value in order[1:]:
