@@ -380,7 +380,10 @@ def test_the_amplitude_of_a_constant_force_is_that_of_the_file(tmp_path):
             "orbits --vary belts[0].friction.kinetic --span 0.1 0.9",
             "belts[0].friction.kinetic in {file} must be <= static = 0.5, got 0.9",
         ),
-        ("orbits --vary belts[0].velocity --also 1", "also must be X1,X2, two finite numbers"),
+        (
+            "orbits --vary belts[0].velocity --also 1",
+            "also must be X1,X2, two finite numbers, got '1'",
+        ),
         ("orbits --vary belts[0].velocity --also nan,0", "also must be X1,X2, two finite numbers"),
         ("simulate --v-star 0.1", "v-star must be left out unless --formulation is switch"),
         ("simulate --formulation switch --v-star 0", "v-star must be finite and > 0, got 0.0"),

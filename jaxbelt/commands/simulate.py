@@ -135,7 +135,8 @@ def simulate(
             if width is not None:
                 check_number(name, width)
                 if formulation != of:
-                    raise ValueError(f"{name} must be left out unless --formulation is {of}")
+                    unless = f"left out unless --formulation is {of}"
+                    raise ValueError(f"{name} must be {unless}, got {width}")
                 width = described.dimensionless(width, "velocity")
             asked[name.replace("-", "_")] = width
         turn_on_float64()

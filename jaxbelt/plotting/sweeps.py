@@ -196,7 +196,6 @@ def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:
     ax.set(**limits)
     for colour, name in zip(colours, basins.attractors, strict=True):
         ax.add_patch(Rectangle((0, 0), 0, 0, facecolor=colour, edgecolor="0.4", label=f"to {name}"))
-    cycles = [c for c in (*basins.cycles, basins.boundary) if c is not None and int(c.status) == 0]
     if basins.boundary is None:
         names = [name for name in basins.attractors if is_cycle(name)]
         marks = zip(basins.cycles, names, cycle("osD^v"), strict=False)
@@ -210,6 +209,7 @@ def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:
         label_plane(ax)
         ax.set(**limits)
     else:
+        cycles = [one for one in (*basins.cycles, basins.boundary) if int(one.status) == 0]
         plot_phase_portrait(basins.oscillator, cycles=cycles, **limits, ax=ax)
     add_key(ax)
     return ax

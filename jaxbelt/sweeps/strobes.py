@@ -204,7 +204,8 @@ class ForcedAttractor(Observer):
 
     def follow(self, take_step, osc, window, ones, lanes, t1, rtol, atol):
         seen: _RunSoFar = lanes.memory
-        strobe = seen.strobes.astype(lanes.t.dtype) * _strobe_period(osc, seen.turns)
+        period = _strobe_period(osc, seen.turns)
+        strobe = seen.strobes.astype(lanes.t.dtype) * period
         until = jnp.where(strobe > lanes.t, jnp.minimum(t1, strobe), t1)
         new = take_step(osc, window, ones, lanes, until, rtol, atol)
         course = course_of_step(osc, lanes, new, ones)
@@ -218,7 +219,6 @@ class ForcedAttractor(Observer):
         extent = self._extended(seen.extent, lanes, new, course)
         seen = replace(seen, growth=growth, extent=choose(going_on & ~cut, extent, seen.extent))
         first_at = growth.began + UNMEASURED * (t1 - growth.began)
-        period = _strobe_period(osc, seen.turns)
         winding = seen.winding.followed(lanes, new, course, first_at, period, ones)
         seen = replace(seen, winding=choose(going_on & ~cut, winding, seen.winding))
         share = (new.t - growth.began) / (t1 - growth.began)

@@ -2,8 +2,8 @@
 
 Through random and round oscillators motions are sought by `find_cycle` from the case's start, and
 by `periodic` from guesses around what a run comes to. The engine starts at the state of each, has
-to come back after its periods with its events, and the eigenvalues of differences of its runs have
-to be its multipliers.
+to come back to it after its periods, and sum and product of its multipliers have to be those of the
+eigenvalues of differences of the engine's runs.
 """
 
 import numpy as np
