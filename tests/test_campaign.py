@@ -15,7 +15,7 @@ import oracle
 import pytest
 
 import jaxbelt as jb
-from jaxbelt.cycles.attractors import itinerary
+from jaxbelt.cycles.attractors import idle_belts, itinerary
 from tests.campaign import __main__ as command
 from tests.campaign import cases, compare, derivatives, engine, package, paths
 from tests.campaign.engine import CROSS, EDGE, SLIP, STICK, Belt, Oscillator
@@ -213,7 +213,7 @@ def test_a_mode_that_does_not_last_is_none(velocity):
     osc = Oscillator(0.1, (left, right), omega=2.0)
     (cycle,) = paths.label_of(osc, [(3.0, 0.0)]).cycles
     found = jb.find_cycle(package.oscillator(osc), (3.0, 0.0))
-    assert cycle.modes == itinerary(found.oscillator, found)
+    assert cycle.modes == itinerary(idle_belts(found.oscillator), found)
     assert cycle.modes == ((0, -1), (2, -1), (2, 0), (1, 0), (1, -2), (1, -1))
 
 

@@ -33,6 +33,7 @@ from ..cycles.attractors import (
     SAME_CYCLE,
     Itinerary,
     distance,
+    idle_belts,
     itinerary,
     place_of,
     sticks,
@@ -50,6 +51,7 @@ from ..model.parameters import leaf_index
 from ..model.variations import as_span, varied
 from ..motion.integrators import STRIDE
 from ..numerics.compiling import each, jit
+from ..numerics.padding import each_row
 from ..results import Status
 from .base import AbstractCondition, check_conditions
 from .connections import SaddleCourse, courses_of
@@ -57,7 +59,7 @@ from .guesses import repeated_loops
 from .labels import AttractingCycle, Label
 
 #: Values of the parameter in one batch.
-BATCH = 32
+BATCH = 16
 #: Room for the arcs of one loop.
 ROOM = SIZES[1]
 #: Values closer than CLOSE * (unit + span) count as equal.
@@ -98,7 +100,7 @@ class ParameterPath:
         #: In own units, the parameter too, like everything that follows.
         ends = np.array([[0.5 * (first + last)], [first], [last]])
         self.variation = given.in_own_units(*ends)
-        self._oscillators: dict[float, Oscillator] = {}
+        self._idle: dict[float, np.ndarray] = {}
         measured = 1.0 if given.units is not None else float(self.variation.own.parameters[0])
         self.first, self.last = first / measured, last / measured
         self.conditions = conditions
@@ -134,10 +136,14 @@ class ParameterPath:
         return end + CLOSE * (middle - end) if vanishes else end
 
     def at(self, value: float) -> Oscillator:
-        """The oscillator at a value, made once."""
-        if value not in self._oscillators:
-            self._oscillators[value] = self.variation.oscillator(np.array([value]))
-        return self._oscillators[value]
+        """The oscillator at a value."""
+        return self.variation.oscillator(np.array([value]))
+
+    def idle(self, value: float) -> np.ndarray:
+        """See `idle_belts`; made once."""
+        if value not in self._idle:
+            self._idle[value] = idle_belts(self.at(value))
+        return self._idle[value]
 
     def unstable(self, value: float, around: int) -> Cycle:
         """The unstable cycle at a value around an equilibrium, or why there is none; computed
@@ -273,10 +279,11 @@ class ParameterPath:
     def _label_batch(self, batch: np.ndarray, stride: float) -> None:
         filled = np.concatenate([batch, np.full(BATCH - batch.size, np.nan)])
         oscs = self.variation.oscillators(filled[:, None])
-        seen = jax.tree.map(np.asarray, _motions(oscs, np.asarray(stride)))
+        seen = _motions(oscs, np.asarray(stride))
         courses = courses_of(oscs) if self.basins and self.edged else [()] * BATCH
-        for lane, value in enumerate(batch.tolist()):
-            self._take(value, jax.tree.map(lambda x, i=lane: x[i], seen), courses[lane])
+        rows = each_row(jax.tree.map(np.asarray, (idle_belts(oscs), seen)))
+        for value, (idle, one), course in zip(batch.tolist(), rows, courses, strict=False):
+            self._take(value, idle, one, course)
 
     def changes(self, explained: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
         """Intervals between labelled values that differ, without those that are explained."""
@@ -287,10 +294,13 @@ class ParameterPath:
             and not (self.labels[a].is_as(self.labels[b]) and self._all_go_on(a, b))
         ]
 
-    def _take(self, value: float, seen: "_Motions", courses: tuple[SaddleCourse, ...]) -> None:
-        """Labels a value by what was seen there."""
+    def _take(
+        self, value: float, idle: np.ndarray, seen: "_Motions", courses: tuple[SaddleCourse, ...]
+    ) -> None:
+        """Labels a value by what was seen there; idle: see `idle_belts`."""
+        self._idle[value] = idle
         exists = seen.kind > 0
-        codes = without_idle(self.at(value), seen.modes[exists])
+        codes = without_idle(idle, seen.modes[exists])
         # The direction in which belts rub at a pseudo-focus makes no difference.
         is_focus = seen.kind[exists, None] == EquilibriumKind.PSEUDO_FOCUS
         codes = np.where(is_focus & (codes == -1), 1, codes)
@@ -298,7 +308,7 @@ class ParameterPath:
         rows = (x[exists].tolist() for x in columns)
         rests = _joined_rests(zip(*rows, map(tuple, codes.tolist()), strict=True))
         found: list[AttractingCycle] = []
-        loops = [jax.tree.map(lambda x, i=i: x[i], seen.loop) for i in range(len(seen.status))]
+        loops = [*each_row(seen.loop)]
         for loop, status in zip(loops, seen.status.tolist(), strict=True):
             one = self._attracting_cycle(value, loop) if status == Status.OK else None
             if one is not None and _number_among(one, found) is None:
@@ -329,9 +339,9 @@ class ParameterPath:
         A loop that sticks is one of it. Any other may only seem to repeat. closes: whether it is
         known to be one loop.
         """
-        osc, ok = self.at(value), jnp.asarray(Status.OK.value)
-        if closes and sticks(path := itinerary(osc, loop)):
+        if closes and sticks(path := itinerary(self.idle(value), loop)):
             return AttractingCycle(path, loop)
+        osc, ok = self.at(value), jnp.asarray(Status.OK.value)
         # Where the cycle has other loops than those from which it is solved for, or meets a
         # boundary, it is followed.
         ways = (lambda: polish(osc, cut([loop])[0], ok), lambda: cycle_from(osc, loop.entries[0]))
@@ -339,7 +349,7 @@ class ParameterPath:
             if int(cycle.status) == Status.OK and abs(float(cycle.multiplier)) < 1:
                 if _is_off_rest(cycle):
                     loop = jax.tree.map(np.asarray, as_loop(cycle, ROOM))
-                    return AttractingCycle(itinerary(osc, loop), loop)
+                    return AttractingCycle(itinerary(self.idle(value), loop), loop)
         return None
 
     def _agree_on_moments(self) -> None:
@@ -355,7 +365,7 @@ class ParameterPath:
                 others = self.cycles[b]
                 for i, one in enumerate(others):
                     if one.path and one.path not in known:
-                        path = itinerary(self.at(b), one.loop, LEAST_MOMENT)
+                        path = itinerary(self.idle(b), one.loop, LEAST_MOMENT)
                         if path in known:
                             others[i] = one._replace(path=path)
                             self._name(b)

@@ -292,7 +292,7 @@ def edges_touched(
         return all(one.status == Status.OK for one in path.unstable_along(values, around))
 
     def modes(value):
-        return itinerary(path.at(value), unstable(value))
+        return itinerary(path.idle(value), unstable(value))
 
     def changes(values):
         known = [v for v in map(float, values) if unstable(v).status == Status.OK]

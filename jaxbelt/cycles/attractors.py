@@ -50,15 +50,16 @@ MAYBE_SAME = 1e-2
 GOES_ON = 0.3
 
 
-def itinerary(osc: Oscillator, loop: Cycle | Loop, moment: float = MOMENT) -> Itinerary:
+def itinerary(idle: np.ndarray, loop: Cycle | Loop, moment: float = MOMENT) -> Itinerary:
     """The modes of one loop in order, from whatever place it was begun.
 
+    idle: see `idle_belts`.
     Modes that last no longer than `moment` are left out: where slip onset lies on an edge rounding
     decides which comes first.
     """
     chain, rows = arcs_of(loop)
     modes, lasts = modes_of(chain), rows[:, 2] > moment
-    modes = without_idle(osc, modes[lasts] if np.any(lasts) else modes)
+    modes = without_idle(idle, modes[lasts] if np.any(lasts) else modes)
     changes = [
         tuple(mode.tolist())
         for before, mode in zip(np.roll(modes, 1, axis=0), modes, strict=True)
@@ -67,9 +68,13 @@ def itinerary(osc: Oscillator, loop: Cycle | Loop, moment: float = MOMENT) -> It
     return of_one_loop(changes or [tuple(modes[0].tolist())])
 
 
-def without_idle(osc: Oscillator, modes: np.ndarray) -> np.ndarray:
-    """Contact codes, [.., belts], in which a belt without load, which does nothing, is absent."""
-    idle = np.array([float(belt.load) == 0 for belt in osc.belts])
+def idle_belts(osc: Oscillator) -> np.ndarray:
+    """Which belts have no load, so that they do nothing, [.., belts]."""
+    return np.stack([np.asarray(belt.load) == 0 for belt in osc.belts], axis=-1)
+
+
+def without_idle(idle: np.ndarray, modes: np.ndarray) -> np.ndarray:
+    """Contact codes, [.., belts], in which belts that do nothing are absent."""
     return np.where(idle, int(ABOVE), modes)
 
 
@@ -123,7 +128,7 @@ def is_same(cycle: Cycle, other: Cycle) -> bool:
     """Whether two cycles of one oscillator are the same; both with status OK."""
     if int(cycle.status) != Status.OK or int(other.status) != Status.OK:
         return False
-    modes, others = (itinerary(one.oscillator, one) for one in (cycle, other))
+    modes, others = (itinerary(idle_belts(one.oscillator), one) for one in (cycle, other))
     return modes == others and bool(distance(place_of(cycle), place_of(other)) < SAME_CYCLE)
 
 

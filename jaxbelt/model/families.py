@@ -1,13 +1,14 @@
 """Oscillators that are linear in parameters: `Family`, what programs know of a variation."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.core import Tracer
 
 from ..checks import is_concrete
 from .oscillator import (
@@ -15,7 +16,7 @@ from .oscillator import (
 )
 
 
-class Family(eqx.Module):
+class Family(NamedTuple):
     """Oscillators by one parameter or two, linear in them: what programs know of a variation.
 
     oscillator: the one at `origin`, [k]; slopes: of each of its leaves by the parameters, [k, ...],
@@ -34,7 +35,7 @@ class Family(eqx.Module):
         one: Any = np if known else jnp
         shift = one.asarray(p) - one.asarray(self.origin)
         for place, (leaf, slope) in enumerate(zip(leaves, self.slopes, strict=True)):
-            if slope is None or (is_concrete(slope) and not np.any(slope)):
+            if slope is None or not (isinstance(slope, Tracer) or np.any(slope)):
                 continue
             # An edge may be infinite, and a parameter NaN: that moves what depends on it only.
             moves = [

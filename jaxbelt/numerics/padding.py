@@ -1,4 +1,5 @@
-"""Arrays made longer: so that few shapes are compiled, or to be cut into groups of one size."""
+"""Rows of trees of arrays: taken apart, and made more of, so that few shapes are compiled or groups
+have one size."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -21,6 +22,12 @@ def in_batches(tree: Any, rows: np.ndarray, size: int) -> Iterator[tuple[np.ndar
     for first in range(0, len(rows), size):
         batch = rows[first : first + size]
         yield batch, filled_up(tree, batch, size)
+
+
+def each_row(tree: Any) -> Iterator[Any]:
+    """The rows of a tree of NumPy arrays, one after another."""
+    leaves, structure = jax.tree.flatten(tree)
+    return (structure.unflatten(row) for row in zip(*leaves, strict=True))
 
 
 def longer(tree: Any, size: int, *, axis: int = 0, fill: int | float | None = None) -> Any:
