@@ -163,9 +163,9 @@ class AbstractCondition(eqx.Module):
 
     def with_clock(self) -> Any:
         """The same condition for forced oscillators; a `ValueError` where there is none."""
-        told = f"{type(self).__name__} is for oscillators that do not know the time"
+        reason = f"{type(self).__name__} is for oscillators that do not know the time"
         other = "use a condition for forced ones, such as jb.PeriodDoubling()"
-        require(False, "osc", f"without a clock: {told}; {other}", "one with forcing")
+        require(False, "osc", f"without a clock: {reason}; {other}", "one with forcing")
 
     def applied_to(self, osc: Oscillator) -> Any:
         """The condition as the class that solves it for that oscillator."""

@@ -1,11 +1,11 @@
 """What there is on the two sides of a change that no condition explains: `Side`.
 
-A branch of cycles that ends there is told by its last cycle. Two numbers say how it ends: how far
-it is from what its orbits lead to on the other side, and how far from the largest loop within it
-that comes to rest. Where a branch of cycles ends in a fold both of its branches come together, and
-the second number goes to zero. Under a very steep law the unstable branch follows the boundary of
-the belt through the thin layer of the law, as a canard, at a multiplier that no number holds: there
-the branches stop apart.
+A branch of cycles that ends there is described by its last cycle. Two numbers say how it ends: how
+far it is from what its orbits lead to on the other side, and how far from the largest loop within
+it that comes to rest. Where a branch of cycles ends in a fold both of its branches come together,
+and the second number goes to zero. Under a very steep law the unstable branch follows the boundary
+of the belt through the thin layer of the law, as a canard, at a multiplier that no number holds:
+there the branches stop apart.
 """
 
 from collections.abc import Sequence
@@ -44,13 +44,13 @@ class Side(eqx.Module):
     inside: Array = eqx.field(metadata=quantity("length"))
 
     def __repr__(self) -> str:
-        told = [
+        ends = [
             f"{_words(cycle)}, {number(jump)} from what is on the other side, "
             f"{number(inside)} outside the largest loop that comes to rest"
             for cycle, jump, inside in zip(self.cycles, self.jumps, self.inside, strict=True)
         ]
-        told = told or ["no cycle that ends"]
-        return f"at {number(self.value)} {'; '.join(told)}; {self.equilibria!r}"
+        ends = ends or ["no cycle that ends"]
+        return f"at {number(self.value)} {'; '.join(ends)}; {self.equilibria!r}"
 
 
 def _words(cycle: Cycle) -> str:

@@ -237,7 +237,7 @@ def _is_forced(osc: Any, where: Any, span: Any) -> bool:
 
 
 def _made_by(make: Any, value: float) -> Oscillator | None:
-    """The oscillator that a function returns, if it does: what it does else is told elsewhere."""
+    """The oscillator that a function returns, or None: other checks refuse such a function."""
     try:
         made = make(value)
     except Exception:

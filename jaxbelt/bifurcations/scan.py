@@ -461,8 +461,10 @@ def _at_break(path: ParameterPath, value: float) -> list[BifurcationPoint]:
     if not points and not labels[0].is_as(labels[1]):
         # Something else may happen exactly there.
         point = _explained(path, *interval)
-        told = replace(_unexplained(path, *interval), value=jnp.asarray(value), error=jnp.zeros(()))
-        points = [point or told]
+        unknown = replace(
+            _unexplained(path, *interval), value=jnp.asarray(value), error=jnp.zeros(())
+        )
+        points = [point or unknown]
     return points
 
 

@@ -4,7 +4,8 @@ The orbit is followed period by period, and the derivative of the state at the e
 that at its beginning is the product of the maps of its arcs, see `clocked`, in which saltation is
 contained. Two tangents are carried along and made orthogonal after each period; the exponents are
 the mean logarithms of what the factorisation leaves on its diagonal. Behind a stick phase the maps
-have rank one: then the second exponent is -inf, which is told by the arcs and not by rounding.
+have rank one: then the second exponent is -inf, which follows from the kind of arcs, not from
+rounding.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -77,11 +78,11 @@ class Exponents(eqx.Module):
             return f"Exponents({self.exponents.shape})"
         if int(self.status) != Status.OK:
             return f"Exponents({Status(int(self.status)).name}: {describe(self.status)})"
-        told = " and ".join(
+        text = " and ".join(
             f"{number(value)} +- {float(error):.1g}" if np.isfinite(value) else "-inf"
             for value, error in zip(np.asarray(self.exponents), self.standard_errors, strict=True)
         )
-        return f"Exponents({told}, {self.periods} periods)"
+        return f"Exponents({text}, {self.periods} periods)"
 
 
 @announced("lyapunov")

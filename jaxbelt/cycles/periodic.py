@@ -224,10 +224,10 @@ class PeriodicMotion(ClosedMotion):
         events = " ".join(f"{kind.name} {belt}" for kind, belt in self.signature) or "smooth"
         sticks = ", ".join(map(number, self.stick_durations))
         found = np.asarray(self.multipliers)
-        told = ", ".join(f"{one:.6g}" if one.imag else f"{one.real:.6g}" for one in found.tolist())
+        text = ", ".join(f"{one:.6g}" if one.imag else f"{one.real:.6g}" for one in found.tolist())
         return (
             f"PeriodicMotion({self.periods} periods; {events}; sticks ({sticks}), "
-            f"multipliers {told}, {'' if self.stable else 'un'}stable, "
+            f"multipliers {text}, {'' if self.stable else 'un'}stable, "
             f"residual {float(self.residual):.1e})"
         )
 

@@ -138,20 +138,20 @@ def _warn_of_kink(law: AbstractFriction) -> None:
     _asked_of_kinks.add(kind)
     jump, kink = jump_and_kink(law)
     if jump is not None:
-        told = (
+        message = (
             "mu of {} jumps at the speed {:.6g}, from {:.3g} to {:.3g}: motions that pass that "
             "speed are off by far more than the tolerance, and most of their cycles are not found "
             "(NO_CONVERGENCE). Let it change over a small range of speeds instead."
         )
-        warnings.warn(told.format(kind.__name__, *jump), stacklevel=2)
+        warnings.warn(message.format(kind.__name__, *jump), stacklevel=2)
     elif kink is not None:
-        told = (
+        message = (
             "mu of {} has a kink at the speed {:.6g}, its slope goes from {:.3g} to {:.3g}: "
             "motions that slip at that speed are followed, but most of their cycles are not "
             "found (NO_CONVERGENCE). Of a table jb.Tabulated(speeds, coefficients) makes a "
             "smooth law."
         )
-        warnings.warn(told.format(kind.__name__, *kink), stacklevel=2)
+        warnings.warn(message.format(kind.__name__, *kink), stacklevel=2)
 
 
 #: Speeds between which jumps and kinks are searched, and how often their intervals are halved.

@@ -123,8 +123,8 @@ class Variation:
         def numbers(*p):
             osc = make(*p)
             kind = "a number" if isinstance(osc, Tracer) else type(osc).__name__
-            told = f"one that returns {kind}{its_oscillator(osc, 'return')}"
-            require(isinstance(osc, Oscillator), argument, expected, told)
+            came = f"one that returns {kind}{its_oscillator(osc, 'return')}"
+            require(isinstance(osc, Oscillator), argument, expected, came)
             check_scalars(osc)
             if not forced:
                 refuse_clock(osc, VARIED, FOR_FORCED)
@@ -138,8 +138,8 @@ class Variation:
                 def one(p, rest=rest, place=place):
                     return numbers(*rest[:place], p, *rest[place:])
 
-                told = f"one whose argument {names[place]} makes no difference"
-                require(any(depends(one, 0.0)), argument, expected, told)
+                came = f"one whose argument {names[place]} makes no difference"
+                require(any(depends(one, 0.0)), argument, expected, came)
             found = cls(make, names, None)
             if is_affine(numbers, len(values)):
                 return cls(make, names, found._tangent(np.zeros(len(values))))

@@ -188,7 +188,7 @@ def _after_arc(state: RunState, end: ArcEnd, done: Array, t1) -> tuple[RunState,
     status = jnp.where(end.failed, Status.TOO_MANY_STEPS, status)
     status = jnp.where(finite, status, Status.NOT_FINITE)
     done = done | (t >= t1) | (status != Status.OK)
-    # At a pseudo-focus the mass is in no mode; it is told in the one that it came by.
+    # At a pseudo-focus the mass is in no mode; the mode before is reported.
     mode = select(end.captured, state.mode, end.mode)
     return RunState(t, end.y, mode, end.signs, status, done), record
 
@@ -394,7 +394,7 @@ def _as_runs(group: Group, t0: Array, t1: Array, shapes) -> tuple[Any, Array]:
 def arcs_of_run(osc: Oscillator, y0, t0, t1, ts, rtol, atol, rules: Rules):
     """The chain of arcs from y0: the final state, the stacked records of the arcs that were
     followed, NaN where unused, the `RepeatedLoop`, and the states at the times ts, [samples, 2],
-    without derivatives (those past the end are not told)."""
+    without derivatives (those past the end are undefined)."""
     numbers = map(jnp.asarray, (y0, t0, t1, ts, rtol, atol))
     if has_clock(osc):
         return _alone(osc, *numbers, rules=rules)

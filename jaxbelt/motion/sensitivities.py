@@ -181,7 +181,7 @@ def sensitivities(varied, rest, arcs: Arc, remaining: Array) -> Sensitivity:
 
     varied, rest: leaves of the oscillator, see `moving_and_fixed`; remaining: the time from each
     entry to t1.
-    Behind the arcs that were used nothing is told, but in the last row that of the last one.
+    Rows of unused arcs have no meaning, but for the last row, which is that of the last used arc.
     """
     return of_one_run(_sensitivities, varied, rest, arcs, remaining)
 
@@ -212,16 +212,16 @@ def _sensitivities(by_run, varied, rest, arcs: Arc, remaining: Array) -> Sensiti
                 return _past_chunk(by_run, varied, rest, some, left, carry)
 
             def nothing():
-                told = jnp.zeros((width, depth, inputs))
-                return carry, Sensitivity(told, told, told)
+                none = jnp.zeros((width, depth, inputs))
+                return carry, Sensitivity(none, none, none)
 
             return lax.cond(any_lane(jnp.any(some.used)), work, nothing)
 
         (last, _), ends = lax.scan(chunk, (first, first.t), jnp.arange(chunks))
 
-        def in_rows(told, last):
-            told = jnp.moveaxis(told, 0, 1).reshape(width, chunks * depth, inputs)
-            return told.at[:, rows - 1].set(last)
+        def in_rows(chunked, last):
+            flat = jnp.moveaxis(chunked, 0, 1).reshape(width, chunks * depth, inputs)
+            return flat.at[:, rows - 1].set(last)
 
         return None, jax.tree.map(in_rows, ends, last)
 

@@ -185,17 +185,17 @@ class _Kept:
 
     def program(self, leaves: list[Any], structure: Any) -> tuple[Any, list[Any]]:
         """The program of these arguments, and the arrays among them; None: it cannot be kept."""
-        arrays, told = [], []
+        arrays, signatures = [], []
         if PLAIN or not programs.are_kept():
             return None, arrays
         for leaf in leaves:
             if self.is_array(leaf):
                 arrays.append(leaf)
-                told.append(programs.type_of_leaf(leaf))
+                signatures.append(programs.type_of_leaf(leaf))
             else:
                 # 1, 1.0 and True are equal, and so are 0.0 and -0.0.
-                told.append((type(leaf), repr(leaf) if type(leaf) is float else leaf))
-        asked = structure, tuple(told), programs.jax_settings()
+                signatures.append((type(leaf), repr(leaf) if type(leaf) is float else leaf))
+        asked = structure, tuple(signatures), programs.jax_settings()
         try:
             if asked in self.called:
                 return self.called[asked], arrays
@@ -217,7 +217,7 @@ class _Kept:
         holes = [programs.HOLE if self.is_array(leaf) else leaf for leaf in leaves]
         template = jax.tree.unflatten(structure, holes)
         options = self.options()
-        signatures = [told for told, leaf in zip(asked[1], holes) if leaf is programs.HOLE]
+        signatures = [one for one, leaf in zip(asked[1], holes) if leaf is programs.HOLE]
         try:
             key = programs.key_of(self.function, template, signatures, options)
         except Exception:  # its fingerprint cannot be known

@@ -3,8 +3,8 @@
 A program is known by what it was made of: the source of jaxbelt, its name, what it is called with
 but for the numbers, versions, the processor, JAX's settings. `load` gives the program that was kept
 under such a key and `keep` keeps one. Nothing here raises on account of what it finds on the disk:
-what is not there, is damaged or belongs to others is compiled anew, and the logger "jaxbelt" is
-told.
+what is not there, is damaged or belongs to others is compiled anew, and the logger "jaxbelt" says
+so.
 
 A file is a line with a checksum and a pickle. To load it runs its code, so the folder has to belong
 to the user alone. Files are written under another name and then renamed: a process that is killed
@@ -119,8 +119,8 @@ def _files(path: Path) -> Iterator[Entry]:
     with contextlib.suppress(OSError), os.scandir(path) as found:
         for one in found:
             with contextlib.suppress(OSError):
-                told = one.stat(follow_symlinks=False)
-                yield Entry(told.st_mtime, told.st_size, Path(one.path))
+                facts = one.stat(follow_symlinks=False)
+                yield Entry(facts.st_mtime, facts.st_size, Path(one.path))
 
 
 def clear() -> int:
@@ -210,11 +210,11 @@ def surroundings() -> str:
 
 def _sources() -> str:
     """A checksum of the package's source."""
-    top, told = Path(__file__).parent.parent, hashlib.sha256()
+    top, digest = Path(__file__).parent.parent, hashlib.sha256()
     for path in sorted(top.rglob("*.py")):
         contents = path.read_bytes()
-        told.update(f"{path.relative_to(top)} {len(contents)}\n".encode() + contents)
-    return told.hexdigest()
+        digest.update(f"{path.relative_to(top)} {len(contents)}\n".encode() + contents)
+    return digest.hexdigest()
 
 
 #: Folders of jaxbelt whose modules programs are made of. All of them are imported at once.
@@ -229,8 +229,8 @@ def _constants() -> list[str]:
         if name.startswith("jaxbelt.") and name.split(".")[1] in FOLDERS and name != __name__:
             for key, value in vars(module).items():
                 if key.isupper() and isinstance(value, bool | int | float | str | tuple):
-                    told = repr(value)
-                    found.append(f"{name} {key} {told}" if " at 0x" not in told else "")
+                    text = repr(value)
+                    found.append(f"{name} {key} {text}" if " at 0x" not in text else "")
     return found
 
 
@@ -239,10 +239,10 @@ def _processor() -> str:
     words = ("model name", "flags", "features", "cpu part", "cpu implementer")
     try:
         lines = Path("/proc/cpuinfo").read_text().partition("\n\n")[0].splitlines()
-        told = [line for line in lines if line.lower().startswith(words)]
+        described = [line for line in lines if line.lower().startswith(words)]
     except OSError:
-        told = [platform.processor()]
-    return "\n".join([sys.platform, platform.machine(), *told])
+        described = [platform.processor()]
+    return "\n".join([sys.platform, platform.machine(), *described])
 
 
 # --- programs -------------------------------------------------------------------------------------
@@ -318,10 +318,10 @@ def can_be_kept(arrays: list[Any]) -> bool:
 def key_of(function: Callable, template: Any, signatures: Sequence[Any], options: Any) -> str:
     """Identity of a program; raises where this cannot be known."""
     name = getattr(function, "__module__", ""), getattr(function, "__qualname__", "")
-    told = fingerprint((name, function, template, options))
+    mark = fingerprint((name, function, template, options))
     # Without what has no name but its address: an object of JAX, empty outside of traces.
     context = [word for word in map(repr, jax_settings()[0]) if " at 0x" not in word]
-    parts = surroundings(), _constants(), told, [str(one) for one in signatures], context
+    parts = surroundings(), _constants(), mark, [str(one) for one in signatures], context
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
@@ -329,12 +329,12 @@ def compile_and_keep(
     key: str, function: Callable, template: Any, arrays: list[Any], options: Any
 ) -> KeptProgram | None:
     """Compile the program of a function and keep it; None where it cannot be compiled this way."""
-    told: list[Any] = []
+    results: list[Any] = []
 
     def flat(arrays):
         args, kwargs = with_arrays(template, arrays)
         leaves, structure = jax.tree.flatten(function(*args, **kwargs))
-        told[:] = structure, [HOLE if eqx.is_array(leaf) else leaf for leaf in leaves]
+        results[:] = structure, [HOLE if eqx.is_array(leaf) else leaf for leaf in leaves]
         return [leaf for leaf in leaves if eqx.is_array(leaf)]
 
     named = getattr(function, "func", function)  # of a partial
@@ -344,7 +344,7 @@ def compile_and_keep(
         call = _compile(flat, arrays, options)
     except Exception:  # of the function; it is raised again where this is compiled as usual
         return None
-    program = KeptProgram(call, *told)
+    program = KeptProgram(call, *results)
     keep(key, program, template)
     return program
 

@@ -160,7 +160,7 @@ class CircleMap(eqx.Module):
         iterate = f", iterate {self.iterate}" if self.iterate > 1 else ""
         known = int(np.sum(np.isfinite(self.elapsed)))
         rows = zip(self.fixed_points, self.motions, self.stable, self.multipliers, strict=True)
-        told = "; ".join(
+        names = "; ".join(
             f"{phase:.6g} ({motion.periods} periods, {'' if is_stable else 'un'}stable, multiplier "
             f"{multiplier:.6g})"
             for phase, motion, is_stable, multiplier in rows
@@ -168,7 +168,7 @@ class CircleMap(eqx.Module):
         missed = f", {len(self.unsolved)} not solved for" if len(self.unsolved) else ""
         return (
             f"CircleMap(belt {self.belt}, needed = {sign}capacity{iterate}, {known} of "
-            f"{len(self.phases)} phases lead on, fixed points: {told or 'none'}{missed})"
+            f"{len(self.phases)} phases lead on, fixed points: {names or 'none'}{missed})"
         )
 
 

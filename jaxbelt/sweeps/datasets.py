@@ -205,10 +205,10 @@ class Table:
         axes = dict(self.grid.axes)
         if any("belt" in self.dims(name) for name in self.shapes):
             axes["belt"] = np.arange(len(self.grid.example.belts))
-        told = {name: {"long_name": AXIS_NAMES.get(name, name)} for name in axes}
+        attributes = {name: {"long_name": AXIS_NAMES.get(name, name)} for name in axes}
         for name in DIMENSIONS_OF_STARTS.keys() & axes.keys():
-            told[name]["quantity"] = DIMENSIONS_OF_STARTS[name]
-        return {name: (name, values, told[name]) for name, values in axes.items()}
+            attributes[name]["quantity"] = DIMENSIONS_OF_STARTS[name]
+        return {name: (name, values, attributes[name]) for name, values in axes.items()}
 
     def numbered(self) -> list[str]:
         """Variables whose categories are numbered when all runs are known."""

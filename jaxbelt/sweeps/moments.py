@@ -148,13 +148,13 @@ def check_moments(at: tuple[Any, ...], osc: Oscillator) -> None:
     clock = has_clock(osc)
     steady = not any(isinstance(belt.velocity, Oscillating) for belt in osc.belts)
     for moment in at:
-        told = "AtEvents() alone where the velocity of a belt oscillates"
-        require(steady or isinstance(moment, AtEvents), "at", told, repr(moment))
+        expected = "AtEvents() alone where the velocity of a belt oscillates"
+        require(steady or isinstance(moment, AtEvents), "at", expected, repr(moment))
         if isinstance(moment, AtPhase):
             require(clock, "at", "for an oscillator without forcing no AtPhase", repr(moment))
         if isinstance(moment, AtExtrema) and moment.of == "x2":
-            told = 'AtExtrema("x1") or a section: extrema of x2 are for those without a clock'
-            require(not clock, "at", told, repr(moment))
+            expected = 'AtExtrema("x1") or a section: extrema of x2 are for those without a clock'
+            require(not clock, "at", expected, repr(moment))
 
 
 def section_of(moment: AtSection | AtExtrema) -> Callable[..., Array]:
