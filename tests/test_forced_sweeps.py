@@ -172,3 +172,29 @@ def test_a_mass_on_an_edge_that_a_belt_just_begins_to_carry(x2):
     # The belt carries it: x2 = sin(t / 2) / 2.
     np.testing.assert_allclose(found.x1_end[0], -0.5 + 1 - np.cos(0.5), atol=1e-10)
     np.testing.assert_allclose(found.x2_end[0], 0.5 * np.sin(0.5), atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("load", "velocity", "edge", "force", "start"),
+    [
+        (0.0, (0.5, 0.5, np.pi), -1.2, 1.0, (0.0, 0.0)),
+        (0.0, (0.0, 1.0, 1.5 * np.pi), -0.5, 1.6, (-0.5, -1.8369701987210297e-16)),
+        (1e-3, (0.5, 0.5, np.pi), -1.2, 1.0, (0.0, 0.0)),
+        (1e-3, (0.5, 0.5, np.pi), -1.2, -1.0, (0.0, 0.0)),
+    ],
+)
+def test_a_mass_and_a_belt_that_begin_to_move_together(load, velocity, edge, force, start):
+    """Belt and force begin like sin(t / 2): the relative velocity vanishes with its slope at the
+    start. Such a run stood still there, and ended with TOO_MANY_STEPS."""
+    mean, amplitude, phase = velocity
+
+    def make(damping):
+        wave = jb.Oscillating(mean, amplitude, 0.5, phase)
+        belt = jb.Belt(wave, jb.Conti(1.0, 0.6, 10.0), load, lower=edge)
+        return jb.Oscillator(damping, (belt,), forcing=jb.Harmonic(force, 0.5, 1.5 * np.pi))
+
+    found = jb.sweep(make, {"damping": [1.0]}, y0=start, t1=60.0, observe="final")
+    run = jb.simulate(make(1.0), start, 60.0)
+    assert found.status[0] == run.status == jb.Status.OK
+    np.testing.assert_allclose([found.x1_end[0], found.x2_end[0]], run.ys[-1], atol=1e-7)
+    assert found.n_events[0] == np.sum(np.asarray(run.events.kind) > 0)

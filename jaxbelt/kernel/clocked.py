@@ -260,6 +260,11 @@ class _GuardMeeting(eqx.Module):
     delta: Array
     number: Array
 
+    def unless(self, passed: Array) -> "_GuardMeeting":
+        """The same; nothing to do where the guard was passed already."""
+        delta = jnp.where(passed, NEVER, self.delta)
+        return replace(self, once=self.once & ~passed, cut=self.cut & ~passed, delta=delta)
+
 
 def _meeting(
     curve: Polynomial, doubt, rounding, ends, clock: StepClock, room, reach, number
@@ -444,6 +449,9 @@ def take_timed_step(
     new = _timed_attempt(osc, clock, window, lanes, rtol, atol, rates)
     # Integrals are known at the ends of steps, and near to them.
     found = _meetings(osc, clock, window, lanes, new, rtol, atol, rates is not None)
+    # The guard at which nothing changed, see `_through_guards`.
+    passed = jnp.where(window.stuck, -1, lanes.hit)
+    found = [one.unless(one.number == passed) for one in found]
     delta = functools.reduce(jnp.minimum, [one.delta for one in found])
     number = first_of(
         [one.delta == delta for one in found], [one.number for one in found], jnp.asarray(-1)
@@ -486,7 +494,9 @@ def take_timed_step(
         a=jnp.where(kept, new.a, lanes.a),
         h=lax.stop_gradient(jnp.where(going, proposed, lanes.h)),
         pace=lax.stop_gradient(jnp.where(accepted & ~window.stuck, pace, lanes.pace)),
-        hit=jnp.where(lands | stands, number, lanes.hit).astype(lanes.hit.dtype),
+        hit=jnp.where(
+            lands | stands, number, jnp.where(kept & ~window.stuck, -1, lanes.hit)
+        ).astype(lanes.hit.dtype),
         integrals=integrated(rates, osc, lanes, new, delta, x1, x2, kept) if rates else None,
     )
 
@@ -560,8 +570,13 @@ def _through_guards(
     happened = fired & changed
     status = jnp.where(captured, Status.PSEUDO_FOCUS.value, lanes.status)
     status = jnp.where(forever, Status.STUCK_FOREVER.value, status).astype(lanes.status.dtype)
+    # Where the guard vanishes with its slope, rounding chooses the mode, and may choose the same one
+    # again and again: the shortest step is made without that guard.
+    stays = fired & ~changed & ~mode.any_stuck
+    shortest = SHORTEST_TIMED_STEP * LANDING * jnp.sqrt(rtol)
+    begun = jnp.where(stays, shortest, first_step(rtol))
     # A stick phase is known beforehand.
-    h = jnp.where(fired, jnp.where(mode.any_stuck, LONGEST_STEP, first_step(rtol)), abs(lanes.h))
+    h = jnp.where(fired, jnp.where(mode.any_stuck, LONGEST_STEP, begun), abs(lanes.h))
     after = replace(
         lanes,
         x1=x1,
@@ -573,7 +588,7 @@ def _through_guards(
         events=lanes.events + jnp.where(happened, 1, 0).astype(lanes.events.dtype),
         status=status,
         done=captured,
-        hit=jnp.full_like(lanes.hit, -1),
+        hit=jnp.where(stays, lanes.hit, -1).astype(lanes.hit.dtype),
     )
     stuck = released = no
     if is_steady(osc):
