@@ -120,6 +120,8 @@ _NODES, _WEIGHTS = 0.5 * (1 + _NODES), 0.5 * _WEIGHTS
 
 #: Longest step; shortest that is still halved.
 _LONGEST, _SHORTEST = 0.5, 1e-10
+#: Steps of one stick phase; then it is not known how it ends.
+_MOST_ROUNDS = 1_000_000
 #: Distances above this one need no closer look; below it the margin of a run is exact.
 _CLOSE = 1e-6
 #: A distance is zero up to rounding below this many times the size of what it is made of; and
@@ -1099,7 +1101,7 @@ def _nearest(w, B, s, L, t, x1, x2):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _stick_phase(z, w, B, F, s, k, start, x1, T, period, L, shifts, R, Q):
-    """The first end of a stick phase: (line, or -1; time; margin; for ever)."""
+    """The first end of a stick phase: (line, -1: none, -2: not known; time; margin; for ever)."""
     n = B.shape[0]
     lines = 4 + n
     margin = np.inf
@@ -1135,8 +1137,11 @@ def _stick_phase(z, w, B, F, s, k, start, x1, T, period, L, shifts, R, Q):
             _stick_line(z, w, B, F, s, k, start, x1, L, line, start, 0.0, R)
             if abs(R[0]) <= _ROUNDING * size:
                 shifts[line] = 2 * _ROUNDING * size
-    t, h = start, 0.25 / fastest
+    t, h, rounds = start, 0.25 / fastest, 0
     while t < until:
+        rounds += 1
+        if rounds > _MOST_ROUNDS:
+            return -1 if t >= T else -2, T, margin, False
         h = min(h, until - t)
         # Up to T exactly.
         if t < T < t + h:
@@ -1237,6 +1242,9 @@ def _run(z, w, B, F, period, x1, x2, given, t, T, tol, noise, seed, out):
             k = stuck
             line, end, gap, ever = _stick_phase(z, w, B, F, s, k, t, x1, T, period, L, shifts, R, Q)
             margin = min(margin, gap)
+            if line == -2:
+                status = STEPS
+                break
             if line < 0 or end > T:
                 margin = min(margin, end - T if end > T else np.inf)
                 x1 += _travel(B[k], t, T) / w

@@ -12,7 +12,7 @@ from .runs import said as said
 #: Runs in one case, and structures, each a compilation.
 BATCH, PROGRAMS = 128, 12
 #: Runs that are differentiated in the last case of each structure, along one direction each.
-DIFFERENTIATED = 16
+DIFFERENTIATED = 64
 #: Derivatives of the engine that its own differences know to this fraction.
 KNOWN_TO = 1e-8
 
