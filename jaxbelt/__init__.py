@@ -20,7 +20,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     model/          variations modes pseudofocus transitions instants rest events equilibria
     model/          far_out
     presets         the published systems
-    kernel/         lanes marks step events rounds waves holds clocked
+    kernel/         lanes marks step events rounds waves holds clocked timed_events
     motion/         integrators arcs flights sensitivities sampling loops batches timed runs
     motion/         smoothing simulate
     cycles/         chains settling shooting motions closure clocked followed periodic exponents
@@ -41,8 +41,8 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     paper           the paper's table and figures
     api             the public names
     __init__        the public names, imported when the first one is used
-    commands/       belts files options tables reproduce simulate diagram orbits map
-    commands/       sweep basins verify cache warm
+    commands/       belts files options description tables reproduce simulate diagram orbits
+    commands/       map sweep basins verify cache warm
     cli             the command line
     __main__        the command line by `python -m jaxbelt`
 """

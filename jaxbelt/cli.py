@@ -10,9 +10,10 @@ import jaxbelt
 
 from .commands.basins import basins
 from .commands.cache import cache
+from .commands.description import CLASSES, Description
 from .commands.diagram import diagram
 from .commands.map import region_map
-from .commands.options import CLASSES, Description, plain_errors
+from .commands.options import plain_errors
 from .commands.orbits import orbits
 from .commands.reproduce import reproduce
 from .commands.simulate import simulate

@@ -18,7 +18,8 @@ import jaxbelt as jb
 from jaxbelt import paper as reproduce
 from jaxbelt.cli import app
 from jaxbelt.commands.belts import parse_belt
-from jaxbelt.commands.options import Description, tolerances
+from jaxbelt.commands.description import Description
+from jaxbelt.commands.options import tolerances
 from jaxbelt.commands.sweep import VARIABLES
 from jaxbelt.commands.tables import write_table
 from jaxbelt.model.parameters import names_of

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 import jaxbelt as jb
 from jaxbelt.cli import app
 from jaxbelt.commands import files
-from jaxbelt.commands.options import Description
+from jaxbelt.commands.description import Description
 from jaxbelt.commands.simulate import simulate
 from jaxbelt.model.oscillator import constant_force
 from jaxbelt.model.parameters import names_of

@@ -7,14 +7,13 @@ import typer
 
 import jaxbelt as jb
 
+from .description import Description, describes
 from .options import (
-    Description,
     Interval,
     Json,
     Out,
     check_least,
     check_range,
-    describes,
     from_to,
     outputs,
     picture,

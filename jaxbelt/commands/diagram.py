@@ -8,8 +8,8 @@ import typer
 
 import jaxbelt as jb
 
+from .description import Description, describes
 from .options import (
-    Description,
     Interval,
     Json,
     Out,
@@ -19,7 +19,6 @@ from .options import (
     check_least,
     check_range,
     check_word,
-    describes,
     option,
     outputs,
     picture,

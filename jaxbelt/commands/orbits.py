@@ -10,8 +10,8 @@ import typer
 
 import jaxbelt as jb
 
+from .description import Description, describes
 from .options import (
-    Description,
     Json,
     Out,
     Start,
@@ -20,7 +20,6 @@ from .options import (
     check_least,
     check_range,
     check_word,
-    describes,
     outputs,
     picture,
     plain_errors,

@@ -7,8 +7,8 @@ import typer
 
 import jaxbelt as jb
 
+from .description import Description, describes
 from .options import (
-    Description,
     Json,
     Out,
     Start,
@@ -16,7 +16,6 @@ from .options import (
     check_least,
     check_number,
     check_word,
-    describes,
     option,
     outputs,
     plain_errors,

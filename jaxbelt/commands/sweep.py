@@ -9,15 +9,14 @@ import typer
 
 import jaxbelt as jb
 
+from .description import Description, describes
 from .files import FromFile
 from .options import (
-    Description,
     Json,
     Start,
     check_number,
     check_out,
     check_word,
-    describes,
     option,
     picture,
     plain_errors,

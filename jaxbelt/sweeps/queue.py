@@ -24,7 +24,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..kernel import clocked, events, rounds, step
+from ..kernel import clocked, events, rounds, step, timed_events
 from ..kernel.lanes import Lanes, Observer, Program, are_finite, choose
 from ..kernel.rounds import STEPS_PER_ROUND
 from ..model.oscillator import has_clock
@@ -64,7 +64,7 @@ def _moves_of(osc: OwnOscillator, observer: Observer) -> tuple[Callable, Callabl
     """How lanes go on: `pass_events`, `window_of` and `take_step`, with a clock or without."""
     if has_clock(osc):
         jumps = not observer.steps_while_stuck
-        pass_events = functools.partial(clocked.pass_timed_events, jumps=jumps)
+        pass_events = functools.partial(timed_events.pass_timed_events, jumps=jumps)
         return pass_events, clocked.timed_window_of, clocked.take_timed_step
     return events.pass_events, step.window_of, step.take_step
 
