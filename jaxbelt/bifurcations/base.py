@@ -247,6 +247,13 @@ class AbstractCondition(eqx.Module):
             return None
         return replace(point, condition=self.sought.named(point))
 
+    def named_point_beside(
+        self, variation: Variation, value: float, osc: Oscillator, system: Any, x: Any
+    ) -> "BifurcationPoint | None":
+        """The point that is found from this value, with its name, or None, where one beside it is
+        known: the unknowns x of a system, at an oscillator."""
+        return self.named_point_from(variation, value)
+
     def point_from(
         self, variation: Variation, value: float, beginning: Any = None
     ) -> "BifurcationPoint":

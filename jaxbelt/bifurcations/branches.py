@@ -19,8 +19,16 @@ from jaxtyping import Array
 
 from ..activity import note_progress
 from ..cycles.clocked import TimedChain, timed_blocks
-from ..cycles.periodic import PeriodicMotion, is_same_motion, motion_at_unknowns, periodic_from
+from ..cycles.periodic import (
+    PeriodicMotion,
+    begun_off_events,
+    is_same_motion,
+    motion_at_unknowns,
+    periodic_from,
+    state_at_phase_0,
+)
 from ..cycles.shooting import jacobian
+from ..model.events import of_one_loop
 from ..model.families import Family
 from ..model.own_units import OwnOscillator, in_own_units
 from ..model.variations import Variation
@@ -50,6 +58,8 @@ SEARCH_AGAIN = 2e-3
 STRAIGHT_ROWS = 3
 #: Cosine of the largest angle between tangents of neighbours.
 STRAIGHT_BRANCH = 0.95
+#: Where the parameter's part of the tangent is larger its sign is that of the way along the branch.
+SLANTED = 0.01
 #: Steps on each side at most.
 MOST_MOTIONS = 400
 #: So many times as large as the first motion of a branch, and 1, a motion grows beyond all bounds.
@@ -169,8 +179,10 @@ class MotionLeg(NamedTuple):
 
     @classmethod
     def begun(cls, line: ForcedLine, row: MotionRow) -> tuple["MotionLeg", Corrected]:
-        """The leg of a row, and the unknowns and the tangent of the row, if they are found."""
-        leg, u = cls.of(line, row)
+        """The leg of a row, and the unknowns and the tangent of the row, if they are found; its
+        chain begins off events."""
+        motion = begun_off_events(line.at(row.value), row.motion)
+        leg, u = cls.of(line, row._replace(motion=motion))
         return leg, leg.corrected(u, np.eye(u.size)[-1], 0.0)
 
     def corrected(self, u: np.ndarray, tangent: np.ndarray, length: float) -> Corrected:
@@ -189,14 +201,23 @@ class MotionLeg(NamedTuple):
         self, row: MotionRow, tangent: np.ndarray
     ) -> tuple["MotionLeg", np.ndarray, np.ndarray]:
         """The leg in the sizes of a row of it, and with the row's steps of integration; the row's
-        unknowns, and the tangent, in these sizes."""
+        unknowns, and the tangent, in these sizes. Where an event has come near to the phase at
+        which the chain begins, another one takes its place."""
+        if abs(tangent[-1]) > SLANTED:
+            motion = begun_off_events(self.line.at(row.value), row.motion)
+            if motion is not row.motion:
+                leg, begun = MotionLeg.begun(self.line, row._replace(motion=motion))
+                if begun.found and abs(begun.tangent[-1]) > SLANTED:
+                    along = np.sign(tangent[-1] * begun.tangent[-1]) * begun.tangent
+                    return leg, begun.u, along
         leg, u = MotionLeg.of(self.line, row)
         tangent = tangent * np.append(np.asarray(leg.weights / self.weights), 1.0)
         return leg, u, tangent / np.linalg.norm(tangent)
 
     def start(self, u: np.ndarray) -> np.ndarray:
         """The state at the phase 0, also of what is no motion."""
-        return (u[:-1] / np.asarray(self.weights))[:2]
+        z = jnp.asarray(u[:-1] / np.asarray(self.weights)).reshape(-1, 4)
+        return state_at_phase_0(self.line.at(float(self.line.length * u[-1])), self.chain, z)
 
 
 def _linearized_motion(
@@ -457,7 +478,7 @@ def _beyond_point(
                     continue
                 row = MotionRow(there, motion)
                 # Beyond the point the signature that has ended may still solve, by rounding.
-                ended = motion.signature == last.motion.signature
+                ended = of_one_loop(motion.signature) == of_one_loop(last.motion.signature)
                 same = ended if own is None else is_same_motion(own, motion)
                 if not same and MotionLeg.begun(line, row)[1].found:
                     return row, side * direction

@@ -353,8 +353,7 @@ def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: f
         # The signature has changed between the last two points.
         centre = np.array(found[-1].values) if found else 0.5 * (last + beyond.u)[-2:]
         is_end = bool(found) and problem.condition.ends_at_contact
-        place = track.place(last)
-        further = None if is_end else _beyond(problem, last[-2:], centre, place)
+        further = None if is_end else _beyond(problem, track, last, centre)
         if further is None:
             return _ended(problem, rows, special)
         track, u = Track.begun(problem.variation, *further)
@@ -447,13 +446,14 @@ def _row_at(problem: _Problem, track: Track, u: np.ndarray, seen: Seen) -> _Row:
     return _Row(u[-2:], kind, seen.multiplier, seen.residual, track.place(u))
 
 
-def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray, place: np.ndarray):
+def _beyond(problem: _Problem, track: Track, last: np.ndarray, centre: np.ndarray):
     """The point of the same condition just beyond a change of signature, and where, or None.
 
     It has to be the same cycle, at about the same place. The curve may have a corner there, so the
     search goes all around the change, except where the curve came from.
     """
-    condition = problem.condition
+    condition, before, place = problem.condition, last[-2:], track.place(last)
+    known = problem.variation.oscillator(before), track.system, track.unknowns(last)
     came_from = (before - centre) / max(float(np.linalg.norm(before - centre)), 1e-12)
     best: tuple[float, BifurcationPoint, np.ndarray] | None = None
     for free in (0, 1):
@@ -462,7 +462,7 @@ def _beyond(problem: _Problem, before: np.ndarray, centre: np.ndarray, place: np
             held = problem.variation.held(1 - free, float(values[1 - free]))
             for offset in (-1.0, -0.5, -0.25, 0.0, 0.25, 0.5, 1.0):
                 guess = float(values[free]) + offset * problem.step
-                point = condition.named_point_from(held, guess)
+                point = condition.named_point_beside(held, guess, *known)
                 if point is None or is_elsewhere(point.place, place, FAR):
                     continue
                 if point.condition.lineage != condition.lineage:

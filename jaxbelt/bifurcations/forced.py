@@ -37,10 +37,13 @@ from ..cycles.clocked import (
 from ..cycles.periodic import (
     PeriodicMotion,
     attracted,
+    begun_off_events,
     motion_at,
     motions_of,
     nothing_found,
     periodic_from,
+    periods_of,
+    state_at_phase_0,
 )
 from ..model.instants import guards_trend
 from ..model.modes import STUCK, mode_of
@@ -78,17 +81,19 @@ STARTS_OF_MOTIONS = (
 
 
 class ArcRows(NamedTuple):
-    """The arcs of a known motion, in NumPy: codes, ends, and unknowns [arcs, 4]."""
+    """The arcs of a known motion, in NumPy: codes, ends, and unknowns [arcs, 4]; share: where in a
+    period they begin, see `TimedChain`."""
 
     codes: np.ndarray
     ends: np.ndarray
     z: np.ndarray
+    share: Array | None
 
     @classmethod
     def of(cls, motion: PeriodicMotion) -> "ArcRows":
         used = np.asarray(motion.chain.used)
         parts = motion.chain.codes, motion.chain.ends, motion.unknowns
-        return cls(*(np.asarray(part)[used] for part in parts))
+        return cls(*(np.asarray(part)[used] for part in parts), share=motion.chain.share)
 
     def ending(self, row: int, end: int) -> "ArcRows":
         """With another end of the arc of a row."""
@@ -101,9 +106,9 @@ class ArcRows(NamedTuple):
         new = [np.array(list(column)) for column in zip(*rows, strict=True)]
         parts = [
             np.concatenate([own[:first], some.astype(own.dtype), own[last + 1 :]])
-            for own, some in zip(self, new, strict=True)
+            for own, some in zip(self[:3], new, strict=True)
         ]
-        return ArcRows(*parts)
+        return ArcRows(*parts, share=self.share)
 
     def cut(self, row: int, since: float, state: np.ndarray, end: int) -> "ArcRows":
         """With an arc cut where it is at `state`, (x1, x2, t), by that end."""
@@ -162,6 +167,7 @@ class AbstractForcedCondition(AbstractCondition):
     ) -> list[BifurcationPoint]:
         """The points that are found from a motion at a value, [1], of what is varied."""
         osc = lax.stop_gradient(variation.oscillator(value))
+        motion = begun_off_events(osc, motion)
         some = sorted(self.beginnings_of(osc, motion), key=lambda one: one.distance)
         return [self.point_of(variation, osc, value, one) for one in some[:TRIED]]
 
@@ -174,9 +180,21 @@ class AbstractForcedCondition(AbstractCondition):
     def guess(self, osc, size):
         raise NotImplementedError
 
+    def named_point_beside(self, variation, value, osc, system, x):
+        # From the motion at this value, which may have another signature.
+        chain, at = system.chain, np.array([value])
+        start, periods = state_at_phase_0(osc, chain, jnp.asarray(x)), periods_of(chain)
+        motion = periodic_from(variation.oscillator(at), start, periods, chain.turns)
+        if int(motion.status) != Status.OK:
+            return None
+        found = [p for p in self.points(variation, at, motion) if int(p.status) == Status.OK]
+        nearest = min(found, key=lambda point: abs(float(point.value) - value), default=None)
+        return None if nearest is None else replace(nearest, condition=self)
+
     def prepared(self, osc, guess):
         loop = guess.rows.loop()
-        chain, z = _chain_of_motion(osc, loop, least_steps(osc, loop), turns_of(osc))
+        size, share = least_steps(osc, loop), guess.rows.share
+        chain, z = _chain_of_motion(osc, loop, size, turns_of(osc), share)
         system = guess.system(chain)
         return _refined(osc, system, z), z, jnp.asarray(Status.OK.value)
 

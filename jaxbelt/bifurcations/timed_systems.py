@@ -12,6 +12,7 @@ from jaxtyping import Array
 from ..cycles.chains import first_failure
 from ..cycles.clocked import (
     TimedChain,
+    guard_slope,
     monodromy,
     monodromy_and_slopes,
     sticks_in,
@@ -33,6 +34,8 @@ from .systems import PARTS_OF_ARC, AbstractChainSystem, Seen
 
 #: A multiplier that is off by less is the one that the condition asks for.
 ON_CIRCLE = 1e-6
+#: A motion comes to a boundary, and does not only touch it, if r goes to zero faster (own units).
+ARRIVES = 1e-6
 
 
 class TimedSystem(AbstractChainSystem):
@@ -77,7 +80,8 @@ class TimedSystem(AbstractChainSystem):
     def remeshed(self, osc, x):
         # The mesh has been refined, and will be once more.
         size = self.chain.mesh.shape[-1] // PARTS_OF_ARC
-        chain, _ = timed_chain(osc, self.chain.loop(x), size, self.chain.turns)
+        chain = self.chain
+        chain, _ = timed_chain(osc, chain.loop(x), size, chain.turns, chain.share)
         return eqx.tree_at(lambda system: system.chain, self, chain).refined(osc, x)
 
     def error_of_steps(self, osc, x):
@@ -154,7 +158,11 @@ class AtLimit(TimedSystem):
         mode, y = mode_of(self.codes), motion.unknowns[self.row + 1]
         at = guards_trend(osc, mode, y)
         rises = -jnp.where(at.value[-2] < at.value[-1], at.slope[-2], at.slope[-1])
-        return first_failure(motion.status, self.rises * rises >= 0, Status.OTHER_KIND)
+        # A motion that only touches the boundary it arrives at grazes.
+        codes, end = motion.chain.codes[self.row], motion.chain.ends[self.row]
+        arrives = (self.rises == 0) | (guard_slope(osc, codes, end, y) < -ARRIVES)
+        fits = (self.rises * rises >= 0) & arrives
+        return first_failure(motion.status, fits, Status.OTHER_KIND)
 
 
 def place_of_motion(motion: PeriodicMotion) -> np.ndarray:

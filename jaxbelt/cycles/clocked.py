@@ -1,10 +1,12 @@
 """Shooting with a clock: a chain of arcs that is closed after n periods of the forcing.
 
 As in `shooting`, but a state is (x1, x2, t), and a chain begins at the phase 0 of the forcing and
-is cut wherever a period ends, at which t begins at 0 again. For N arcs:
+is cut wherever a period ends, at which t begins at 0 again. Where an event is near the phase 0 it
+begins at another share s of a period P instead, and t at s P. For N arcs:
 
     4N unknowns    entry state (x1, x2, t) and duration T of every arc
-     N equations   the guard of the arc's end vanishes at its end; at the end of a period t - P
+     N equations   the guard of the arc's end vanishes at its end; at the end of a period
+                   t - (1 + s) P
     3N equations   the end of an arc is the entry of the next, after the last comes the first
 
 The derivative of the end of an arc by its entry, at the time at which its guard vanishes, holds
@@ -34,7 +36,7 @@ from ..numerics.compiling import any_lane, jit, power_of_two
 from ..numerics.implicit import Equations, step_to_root
 from ..numerics.newton import HOLDS
 from ..numerics.polynomials import derivative, polynomial, quintic
-from .chains import Chain, Loop, following_codes
+from .chains import Chain, Loop, after_each, following_codes
 from .shooting import (
     ARC_STEPS,
     FINE,
@@ -67,10 +69,11 @@ EXTREMUM_STEPS = 2
 
 
 class TimedChain(Chain):
-    """A chain that begins at the phase 0 of the forcing; turns: periods of the first wave in one
-    of all that knows the time."""
+    """A chain of whole periods; turns: periods of the first wave in one of all that knows the time;
+    share: where in a period it begins, in [0, 1); None: at the phase 0."""
 
     turns: int = eqx.field(static=True, kw_only=True)
+    share: Array | None = eqx.field(default=None, kw_only=True)
 
 
 def turns_of(osc: Oscillator) -> int:
@@ -138,19 +141,24 @@ def timed_mesh(osc: Oscillator, size: int, codes: Array, y: Array, duration: Arr
     return jnp.where(slips, jnp.diff(grid), jnp.zeros(size).at[0].set(1.0))
 
 
-def timed_chain(osc: Oscillator, loop: Loop, size: int, turns: int) -> tuple[TimedChain, Array]:
+def timed_chain(
+    osc: Oscillator, loop: Loop, size: int, turns: int, share: Array | None = None
+) -> tuple[TimedChain, Array]:
     """The chain of a loop with its mesh, and the guess of its unknowns, [N, 4]."""
     osc, loop = lax.stop_gradient((osc, loop))
     meshes = arc_by_arc(lambda osc, *row: timed_mesh(osc, size, *row))
     mesh = meshes((osc,), (loop.codes, loop.entries, loop.durations))
     z = jnp.concatenate([loop.entries, loop.durations[:, None]], axis=1)
-    return lax.stop_gradient((TimedChain(loop.codes, loop.ends, mesh, turns=turns), z))
+    chain = TimedChain(loop.codes, loop.ends, mesh, turns=turns, share=share)
+    return lax.stop_gradient((chain, z))
 
 
 # --- equations ------------------------------------------------------------------------------------
 
 
-def _timed_arc_equations(turns: int, osc: Oscillator, codes, end, mesh, unknown: Array) -> Array:
+def _timed_arc_equations(
+    turns: int, osc: Oscillator, share, codes, end, mesh, unknown: Array
+) -> Array:
     """(x1, x2, t, guard) at the end of one arc, from its unknowns (x1, x2, t, T).
 
     An unused arc ends as it begins, and its guard is its duration.
@@ -159,19 +167,20 @@ def _timed_arc_equations(turns: int, osc: Oscillator, codes, end, mesh, unknown:
 
     def followed(unknown):
         after = flow(osc, codes, mesh, unknown[:3], unknown[3])
-        left = after[2] - forcing_period(osc, turns)
+        period = forcing_period(osc, turns)
+        left = after[2] - period * (1.0 if share is None else 1.0 + share)
         guard = jnp.where(end == names.period, left, end_guard(osc, codes, end, after))
-        after = after.at[2].set(jnp.where(end == names.period, left, after[2]))
+        after = after.at[2].set(jnp.where(end == names.period, after[2] - period, after[2]))
         return jnp.append(after, guard)
 
     return lax.cond(any_lane(end != names.unused), followed, lambda unknown: unknown, unknown)
 
 
-def _and_columns(turns: int, osc, along, codes, end, mesh, unknown: Array):
+def _and_columns(turns: int, osc, along, share, codes, end, mesh, unknown: Array):
     """`_timed_arc_equations` and their derivatives, by the unknowns and along, [4, 4 + k]."""
 
     def equations(osc, u):
-        return _timed_arc_equations(turns, osc, codes, end, mesh, u)
+        return _timed_arc_equations(turns, osc, share, codes, end, mesh, u)
 
     return with_columns(equations, osc, along, unknown)
 
@@ -201,12 +210,14 @@ def _timed_mismatch(out: Array, z: Array) -> Array:
 
 def timed_residual(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
     """The 4N equations at the unknowns z, [N, 4]: mismatch of x1, x2, t, and the guard."""
-    return _timed_mismatch(_timed_equations(chain.turns)((osc,), _timed_rows(chain, z)), z)
+    rows = _timed_rows(chain, z)
+    return _timed_mismatch(_timed_equations(chain.turns)((osc, chain.share), rows), z)
 
 
 def timed_blocks(osc: Oscillator, along: Oscillator | None, chain: TimedChain, z: Array):
     """`timed_residual`, and its derivatives as `shooting.residual_and_blocks` has them."""
-    out, blocks = _timed_equations_and_blocks(chain.turns)((osc, along), _timed_rows(chain, z))
+    given = osc, along, chain.share
+    out, blocks = _timed_equations_and_blocks(chain.turns)(given, _timed_rows(chain, z))
     return _timed_mismatch(out, z), blocks
 
 
@@ -232,9 +243,9 @@ class TimedClosed(Equations):
 # --- the monodromy matrix -------------------------------------------------------------------------
 
 
-def _arc_map(turns, osc, codes, end, mesh, unknown: Array) -> Array:
+def _arc_map(turns, osc, share, codes, end, mesh, unknown: Array) -> Array:
     """How the state in which the next arc begins moves with that in which this one does, [3, 3]."""
-    _, blocks = _and_columns(turns, osc, None, codes, end, mesh, unknown)
+    _, blocks = _and_columns(turns, osc, None, share, codes, end, mesh, unknown)
     by_entry, by_time = blocks[:, :3], blocks[:, 3]
     return by_entry[:3] - jnp.outer(by_time[:3], by_entry[3] / by_time[3])
 
@@ -243,18 +254,18 @@ _arc_maps = _by_turns(_arc_map)
 
 
 @_by_turns
-def _maps_and_slopes(turns, osc, along, codes, end, mesh, unknown: Array):
+def _maps_and_slopes(turns, osc, along, share, codes, end, mesh, unknown: Array):
     """`_arc_map` and its derivatives by the unknowns and along directions, [3, 3, 4 + k]."""
 
     def arc_map(osc, u):
-        return _arc_map(turns, osc, codes, end, mesh, u)
+        return _arc_map(turns, osc, share, codes, end, mesh, u)
 
     return with_columns(arc_map, osc, along, unknown)
 
 
 def arc_maps(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
     """`_arc_map` of all arcs, [N, 3, 3]."""
-    return _arc_maps(chain.turns)((osc,), _timed_rows(chain, z))
+    return _arc_maps(chain.turns)((osc, chain.share), _timed_rows(chain, z))
 
 
 def _product(maps: Array) -> Array:
@@ -286,7 +297,8 @@ def monodromy_and_slopes(
     osc: Oscillator, along: Oscillator, chain: TimedChain, z: Array
 ) -> tuple[Array, Array, Array]:
     """`monodromy`, and its derivatives by z, [2, 2, N, 4], and along directions, [2, 2, k]."""
-    maps, slopes = _maps_and_slopes(chain.turns)((osc, along), _timed_rows(chain, z))
+    given = osc, along, chain.share
+    maps, slopes = _maps_and_slopes(chain.turns)(given, _timed_rows(chain, z))
 
     def times(total, one):
         return one @ total, total
@@ -324,6 +336,24 @@ def multipliers_of(matrix: Array, sticks: Array) -> Array:
 
 
 # --- along the arcs -------------------------------------------------------------------------------
+
+
+def states_at_phase(osc: Oscillator, chain: TimedChain, z: Array, phase: Array) -> Array:
+    """The states (x1, x2) of all arcs at a phase, a share of a period, [N, 2]; NaN of those that do
+    not pass it, so that there is one for each period."""
+    begins = 0.0 if chain.share is None else chain.share
+    t = forcing_period(osc, chain.turns) * jnp.where(phase < begins, phase + 1, phase)
+
+    def one(osc, t, codes, is_last, mesh, unknown, following):
+        passes = lax.stop_gradient((unknown[2] <= t) & (is_last | (following > t)))
+        since = jnp.where(passes, t - unknown[2], 0.0)
+        state = flow(osc, codes, mesh, unknown[:3], since)[:2]
+        return jnp.where(passes, state, jnp.nan)
+
+    is_last = chain.ends == Ends(len(osc.belts)).period
+    columns = chain.codes, is_last, chain.mesh, z, after_each(chain, z[:, 2])
+    found = arc_by_arc(one)((osc, t), columns)
+    return jnp.where(chain.used[:, None], found, jnp.nan)
 
 
 def states_along(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array) -> Array:
@@ -456,7 +486,7 @@ def _least(
     return function(state(s))
 
 
-def _guard_slope(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
+def guard_slope(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
     """How fast the guard that ends an arc rises there; 0 of arcs that end otherwise."""
     mode, names = mode_of(codes), Ends(len(osc.belts))
     at = guards_trend(osc, mode, y)
@@ -486,7 +516,7 @@ def timed_admissible(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
         crosses = (end < n) & ~jnp.any(after == 0) & jnp.any(flips)
         would_stick = crosses & (needed < capacity(now, held) - TOUCHES_AGAIN)
         least = least_guard(osc, codes, mesh, y, duration)
-        late = _guard_slope(osc, codes, end, end_state) > COMES_BACK
+        late = guard_slope(osc, codes, end, end_state) > COMES_BACK
         stays = on_belt & (duration >= -HOLDS) & (least >= -TOUCHES_AGAIN)
         return stays & ~late & ~would_stick
 

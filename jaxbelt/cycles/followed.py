@@ -20,8 +20,8 @@ PERIODS_AT_ONCE = 32
 class Followed(NamedTuple):
     """An orbit that was followed over whole periods, in NumPy.
 
-    codes, ends, entries (x1, x2, t), durations: of its arcs, as of a `Loop`; starts: the states at
-    the phase 0, [periods + 1, 2]; status: of the run.
+    codes, ends, entries (x1, x2, t), durations: of its arcs, as of a `Loop`; starts: the states
+    where periods begin, [periods + 1, 2]; status: of the run.
     """
 
     codes: np.ndarray
@@ -51,14 +51,14 @@ class Followed(NamedTuple):
         return padded_loop(self.codes, self.ends, self.entries, self.durations)
 
 
-def arcs_over(osc: Oscillator, y0: Any, turns: int) -> Followed:
+def arcs_over(osc: Oscillator, y0: Any, turns: int, share: float = 0.0) -> Followed:
     """The orbit from the state y0 at the phase 0, over PERIODS_AT_ONCE periods, if it gets so far.
 
-    osc: known, in its own units.
+    osc: known, in its own units. share: of a period, at which it begins instead.
     """
     period = float(forcing_period(osc, turns))
-    cuts = period * np.arange(1, PERIODS_AT_ONCE + 1)
-    run = simulate(osc, y0, cuts[-1], ts=cuts)
+    cuts = period * (np.arange(1, PERIODS_AT_ONCE + 1) + share)
+    run = simulate(osc, y0, cuts[-1], t0=period * share, ts=cuts)
     arcs, states = run.arcs, np.asarray(run.ys)
     modes, times = np.asarray(arcs.mode, float), np.asarray(arcs.t)
     entries = np.column_stack([np.asarray(arcs.y), times])
@@ -77,7 +77,7 @@ def arcs_over(osc: Oscillator, y0: Any, turns: int) -> Followed:
     found = [row[2] - np.array([0.0, 0.0, period * k]) for row, k in zip(rows, begun)]
     for place, row in enumerate(rows):
         if row[1]:
-            found[place][2] = 0.0
+            found[place][2] = period * share
     lengths = np.diff([row[0] for row in rows])
     codes = np.array([row[3] for row in rows])
     ends = [

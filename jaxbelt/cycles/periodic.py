@@ -42,6 +42,7 @@ from .clocked import (
     least_steps,
     monodromy,
     multipliers_of,
+    states_at_phase,
     sticks_in,
     timed_admissible,
     timed_chain,
@@ -70,6 +71,10 @@ KNOWN_MOTION = 1e-7
 #: States of two motions that differ by less are one; of one motion, each of which is known to
 #: KNOWN_MOTION, where the least number of periods is asked for.
 SAME_STATE, SAME_OF_MOTION = 1e-7, 1e-6
+#: Arcs that take no longer lie between an event and the beginning of a period, maybe.
+AT_PHASE_0 = 1e-4
+#: How far from events a chain has to begin, over the longest time between two of them.
+OFF_EVENTS = 0.25
 #: Newton steps on the state at phase 0 where the arcs that were followed are not those sought.
 OUTER_STEPS = 12
 
@@ -81,9 +86,10 @@ class PeriodicMotion(ClosedMotion):
 
     Attributes:
         oscillator: Whose motion it is.
-        chain: Its arcs, from the phase 0 on; padded.
-        unknowns: (x1, x2, t, duration) at the entry of every arc, t counted from the last phase 0,
-            [arcs, 4].
+        chain: Its arcs; padded. They begin at the phase 0, or, where events are near to that, at
+            another phase, `chain.share` of a period.
+        unknowns: (x1, x2, t, duration) at the entry of every arc, t counted from the last phase 0
+            before the arcs of a period begin, [arcs, 4].
         multipliers: Both Floquet multipliers, complex, the larger one first. Of a motion that
             sticks the second is exactly 0.
         residual: Largest error in the equations.
@@ -102,7 +108,7 @@ class PeriodicMotion(ClosedMotion):
     @property
     def periods(self) -> int:
         """After how many periods of the forcing it repeats."""
-        return int(np.max(np.asarray(self._period_ends)))
+        return periods_of(self.chain)
 
     @property
     def _period_ends(self) -> Array:
@@ -121,11 +127,16 @@ class PeriodicMotion(ClosedMotion):
     @property
     def start(self) -> Array:
         """The state (x1, x2) at the phase 0: at t = 0."""
-        return self.unknowns[..., 0, :2]
+        if self.chain.share is None:
+            return self.unknowns[..., 0, :2]
+        return _first_state(_at_phase_0(self))
 
     @property
     def starts(self) -> Array:
         """The states (x1, x2) at the phase 0 of each of its periods, [periods, 2]."""
+        if self.chain.share is not None:
+            states = _at_phase_0(self)
+            return states[np.flatnonzero(np.isfinite(np.asarray(states[:, 0])))]
         cuts = np.flatnonzero(np.asarray(self.chain.ends) == self._ends.period)
         return self.unknowns[jnp.asarray(np.append(0, cuts[:-1] + 1)), :2]
 
@@ -243,6 +254,14 @@ def extrema_of(motion: PeriodicMotion) -> Array:
 _extrema = jit(extrema_along)
 
 
+def _at_phase_0(motion: PeriodicMotion) -> Array:
+    """The states of the arcs of a motion, or of each of a batch, at the phase 0, [..., arcs, 2]."""
+    function = _states_at_phase
+    for _ in range(motion.unknowns.ndim - 2):
+        function = jax.vmap(function, in_axes=(0, 0, 0, None))
+    return function(motion.oscillator, motion.chain, motion.unknowns, jnp.zeros(()))
+
+
 # --- solutions ------------------------------------------------------------------------------------
 
 
@@ -291,9 +310,12 @@ def _motion_with_derivatives(osc: Oscillator, motion: PeriodicMotion) -> Periodi
 _timed_chain_of = jit(timed_chain)
 
 
-def solved_from(osc: Oscillator, loop: Loop, turns: int) -> PeriodicMotion:
-    """The motion that a loop nearly is, with as many steps of integration as it takes."""
-    chain, guess = _timed_chain_of(osc, loop, least_steps(osc, loop), turns)
+def solved_from(
+    osc: Oscillator, loop: Loop, turns: int, share: Array | None = None
+) -> PeriodicMotion:
+    """The motion that a loop nearly is, with as many steps of integration as it takes; share: see
+    `TimedChain`."""
+    chain, guess = _timed_chain_of(osc, loop, least_steps(osc, loop), turns, share)
     motion, error = _polished_motion(osc, chain, guess)
     for _ in range(MESH_HALVINGS):
         converged = int(motion.status) in (Status.OK, Status.NOT_ADMISSIBLE)
@@ -314,7 +336,70 @@ def motion_at_unknowns(osc: Oscillator, chain: TimedChain, z: Array) -> Periodic
     converged = int(motion.status) in (Status.OK, Status.NOT_ADMISSIBLE)
     if not converged or float(error) < EXACT_MOTION:
         return motion
-    return solved_from(osc, chain.loop(z), chain.turns)
+    return solved_from(osc, chain.loop(z), chain.turns, chain.share)
+
+
+def _without_doubles(osc: Oscillator, motion: PeriodicMotion) -> PeriodicMotion:
+    """The motion; where an event at the phase 0 may stand at both ends of its chain, the chain
+    begins elsewhere."""
+    if int(motion.status) != Status.OK:
+        return motion
+    used = np.asarray(motion.chain.used)
+    shortest = np.min(np.asarray(motion.unknowns)[used, 3])
+    return begun_off_events(osc, motion) if shortest < AT_PHASE_0 else motion
+
+
+def begun_off_events(osc: Oscillator, motion: PeriodicMotion) -> PeriodicMotion:
+    """The motion with a chain that begins where no event is near: in the middle of the longest time
+    between any two phases with events. As it is where that is hardly farther from them, or where
+    following the motion from there does not lead to it.
+
+    osc: its oscillator, known, in own units.
+    """
+    chain, z = motion.chain, np.asarray(motion.unknowns)
+    period = float(forcing_period(osc, chain.turns))
+    ends = np.asarray(chain.ends)[np.asarray(chain.used)]
+    is_event = np.roll(ends != Ends(len(osc.belts)).period, 1)
+    phases = np.sort(z[: len(ends)][is_event, 2] / period % 1.0)
+    if int(motion.status) != Status.OK or not phases.size:
+        return motion
+    gaps = np.diff(phases, append=phases[0] + 1)
+    widest = int(np.argmax(gaps))
+    share = (phases[widest] + 0.5 * gaps[widest]) % 1.0
+    begins = 0.0 if chain.share is None else float(chain.share)
+    off = np.abs(phases - begins)
+    if np.min(np.minimum(off, 1 - off)) >= OFF_EVENTS * gaps[widest]:
+        return motion
+    state = _first_state(_states_at_phase(osc, chain, motion.unknowns, jnp.asarray(share)))
+    followed = arcs_over(osc, np.asarray(state), chain.turns, share)
+    if len(followed.starts) <= motion.periods:
+        return motion
+    loop = followed.first(motion.periods).loop()
+    found = solved_from(osc, loop, chain.turns, jnp.asarray(share))
+    same = int(found.status) == Status.OK and is_same_motion(found, motion)
+    return found if same else motion
+
+
+def periods_of(chain: TimedChain) -> int:
+    """How many periods a chain has; of a batch, the largest number."""
+    is_end = np.asarray(chain.ends) == Ends(chain.codes.shape[-1]).period
+    return int(np.max(np.sum(is_end, axis=-1)))
+
+
+_states_at_phase = jit(states_at_phase)
+
+
+def state_at_phase_0(osc: Oscillator, chain: TimedChain, z: Array) -> np.ndarray:
+    """The state at the phase 0 of unknowns of a chain, whether they solve its equations or not."""
+    if chain.share is None:
+        return np.asarray(z)[0, :2]
+    return np.asarray(_first_state(_states_at_phase(osc, chain, z, jnp.zeros(()))))
+
+
+def _first_state(states: Array) -> Array:
+    """The first of the states, [..., arcs, 2], that is not NaN, if there is one."""
+    first = jnp.argmax(jnp.isfinite(states[..., 0]), axis=-1)
+    return jnp.take_along_axis(states, first[..., None, None], axis=-2)[..., 0, :]
 
 
 def nothing_found(osc: Oscillator, turns: int, status: int) -> PeriodicMotion:
@@ -422,6 +507,7 @@ def _differentiable_motion(osc: Oscillator, y: Array, find: Any) -> PeriodicMoti
     turns = turns_of(still)
     own = in_own_units(still)
     motion = find(own, np.asarray(y if own is still else own.units.into(y)), turns)
+    motion = _without_doubles(own, motion)
     if is_concrete(osc):
         return in_given_units(motion, osc, own)
     own = in_own_units(osc)
