@@ -20,10 +20,16 @@ from tests.campaign import forced, forced_cases
 OK = jb.Status.OK
 
 
-def bkn(frequency, amplitude=0.1):
+def bkn(frequency, amplitude=0.1, phase=0.0):
     """The oscillator of di Bernardo, Kowalczyk and Nordmark, 2003."""
-    law = jb.Cubic(1.5, 1.5, 0.45)
-    return jb.Oscillator(0.0, (jb.Belt(1.0, law),), forcing=jb.Harmonic(amplitude, frequency))
+    force = jb.Harmonic(amplitude, frequency, phase)
+    return jb.Oscillator(0.0, (jb.Belt(1.0, jb.Cubic(1.5, 1.5, 0.45)),), forcing=force)
+
+
+def stribeck(frequency, phase):
+    """An oscillator whose motion sticks once a period."""
+    belt = jb.Belt(0.1139, jb.Stribeck(0.5, 0.3, 0.0474))
+    return jb.Oscillator(0.2108, (belt,), forcing=jb.Harmonic(0.15, frequency, phase))
 
 
 def bkn_of_engine(frequency):
@@ -687,3 +693,71 @@ def test_no_motion_begins_a_stick_phase_off_its_belt():
     # What it was, is none.
     wrong = jnp.array([1.36221451, 0.30946912])
     assert motion.status != jb.Status.OK or jnp.max(jnp.abs(motion.start - wrong)) > 1e-3
+
+
+# --- where t is 0 makes no difference -------------------------------------------------------------
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.5])
+def test_a_motion_with_an_event_at_the_phase_0_has_it_once(phase):
+    """At the first phase the mass begins to stick 2e-5 before t = 0."""
+    motion = jb.find_cycle(stribeck(1.2315, phase), (0.4, -0.2))
+    kinds = sorted(int(kind) for kind, _ in motion.signature)
+    assert kinds == [jb.EventKind.STICK, jb.EventKind.SLIP]
+    assert float(motion.multipliers[0].real) == pytest.approx(-0.84862, abs=1e-4)
+    # The state at t = 0, from which the motion comes back after a period.
+    run = jb.simulate(motion.oscillator, motion.start, motion.period)
+    np.testing.assert_allclose(run.ys[-1], motion.start, atol=1e-8)
+    np.testing.assert_allclose(motion.starts[0], motion.start, atol=1e-15)
+
+
+def test_the_derivative_of_a_start_of_a_chain_that_begins_elsewhere():
+    def start(amplitude):
+        osc = stribeck(1.2315, 0.0)
+        osc = replace(osc, forcing=(jb.Harmonic(amplitude, 1.2315),))
+        return jb.find_cycle(osc, (0.4, -0.2)).start
+
+    # Farther off the mass slips at t = 0.
+    slope, step = jax.jacfwd(start)(0.15), 1e-6
+    differences = (start(0.15 + step) - start(0.15 - step)) / (2 * step)
+    np.testing.assert_allclose(slope, differences, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.slow(first=True)
+def test_a_branch_goes_on_where_an_event_passes_the_phase_0():
+    found = jb.bifurcation_diagram(lambda f: stribeck(f, 0.0), span=(0.9, 1.265))
+    (branch,) = found.branches
+    assert found.points == () and found.open_ends == ()
+    assert branch.values.min() == 0.9 and branch.values.max() == 1.265
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("phase", [0.0, 2.0, 2.6, np.pi])
+def test_points_of_a_branch_do_not_depend_on_where_t_is_0(phase):
+    """At 1.66769 the motion of two periods that slips comes to touch the belt, for both multipliers
+    of it, -1.264258 and -0.035038, SciPy's: it does not cross it."""
+    frequency = 1.68
+    circle = jb.circle_map(bkn(frequency, phase=phase))
+    start = circle.motions[int(np.argmax(circle.stable))]
+    found = jb.bifurcation_diagram(
+        lambda f: bkn(f, phase=phase), span=(1.66, 1.70), start=start, rows=40
+    )
+    assert [type(point.condition) for point in found.points] == [jb.GrazingSliding, jb.Fold]
+    assert found.open_ends == ()
+    grazing, fold = found.points
+    assert float(grazing.value) == pytest.approx(1.667690998106, abs=1e-10)
+    assert grazing.cycle.multipliers == pytest.approx([-1.264258, -0.035038], abs=1e-6)
+    assert float(fold.value) == pytest.approx(1.683440572496, abs=1e-10)
+    point = jb.refine(jb.Fold(), lambda f: bkn(f, phase=phase), at=frequency, start=start)
+    assert float(point.value) == pytest.approx(1.683440572496, abs=1e-10)
+
+
+@pytest.mark.slow
+def test_a_curve_of_period_doublings_ends_where_the_motion_begins_to_stick():
+    point = jb.refine(jb.PeriodDoubling(), jb.presets.di_bernardo, at=1.713)
+    curve = jb.bifurcation_curve(point, jb.presets.di_bernardo, ((1.6, 1.9), (0.02, 0.2)))
+    frequency, amplitude = curve.values.T
+    assert amplitude.max() == pytest.approx(0.2, abs=1e-12)
+    # There the curve of grazing of the motion of twice the period ends, too.
+    end = np.argmin(amplitude)
+    assert (frequency[end], amplitude[end]) == pytest.approx((1.6596, 0.0878), abs=2e-3)
