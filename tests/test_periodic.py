@@ -709,6 +709,7 @@ def test_a_motion_with_an_event_at_the_phase_0_has_it_once(phase):
     run = jb.simulate(motion.oscillator, motion.start, motion.period)
     np.testing.assert_allclose(run.ys[-1], motion.start, atol=1e-8)
     np.testing.assert_allclose(motion.starts[0], motion.start, atol=1e-15)
+    np.testing.assert_allclose(motion.sample(5)[0], motion.start, atol=1e-12)
 
 
 def test_the_derivative_of_a_start_of_a_chain_that_begins_elsewhere():
@@ -721,6 +722,15 @@ def test_the_derivative_of_a_start_of_a_chain_that_begins_elsewhere():
     slope, step = jax.jacfwd(start)(0.15), 1e-6
     differences = (start(0.15 + step) - start(0.15 - step)) / (2 * step)
     np.testing.assert_allclose(slope, differences, rtol=1e-5, atol=1e-5)
+
+
+def test_the_error_of_an_exponent_is_no_less_than_rounding():
+    """Without damping and load both exponents are zero."""
+    belt = jb.Belt(0.3, jb.Coulomb(1.0, 1.0), 0.0)
+    osc = jb.Oscillator(0.0, (belt,), forcing=jb.Harmonic(1.0, 2.0))
+    found = jb.lyapunov(osc, (1.0, 0.0), periods=50, transient=0)
+    assert found.exponents[0] >= found.exponents[1]
+    assert np.all(np.abs(found.exponents) <= 3 * found.standard_errors)
 
 
 @pytest.mark.slow(first=True)

@@ -34,7 +34,7 @@ from ..cycles.attractors import PLACE_DIMENSIONS, place_of
 from ..cycles.chains import SIZES, Chain, Loop, blank_loop
 from ..cycles.cycle import Cycle
 from ..model.families import Family
-from ..model.oscillator import Oscillator, has_clock
+from ..model.oscillator import Oscillator, has_clock, has_possible_numbers
 from ..model.own_units import in_own_units, quantity, rescaled
 from ..model.variations import Variation
 from ..results import Status, describe, draw
@@ -220,12 +220,15 @@ class AbstractCondition(eqx.Module):
             return self.point_near(family, system, x, p, status)
 
         point, agrees = variation.relinearised(attempt, (x, value))
-        if agrees is True:
+        if agrees is True and is_concrete(osc):
             return point
-        fails = (point.status == Status.OK) & ~jnp.asarray(agrees)
+        # Inside of a trace nothing was refused before.
+        possible = has_possible_numbers(osc)
+        fails = (point.status == Status.OK) & ~(jnp.asarray(agrees) & possible)
         numbers = ("value", "residual", "error", "multiplier")
         known = {name: jnp.where(fails, jnp.nan, getattr(point, name)) for name in numbers}
         status = jnp.where(fails, Status.NO_CONVERGENCE.value, point.status)
+        status = jnp.where(possible, status, Status.NOT_FINITE.value)
         return replace(point, **known, status=status)
 
     def point(

@@ -70,12 +70,23 @@ class ClosedMotion(eqx.Module):
         Returns:
             The states (x1, x2), [n, 2].
         """
-        return sampled_chain(self.oscillator, self.chain, self.unknowns, as_whole(n, "n"))
+        given = self.oscillator, self.chain, self.unknowns
+        return sampled_chain(*given, as_whole(n, "n"), self.since_beginning)
+
+    @property
+    def since_beginning(self) -> Array | None:
+        """The time from where its chain begins to where its samples begin; None: 0."""
+        return None
 
 
 @jit
-def sampled_chain(osc: Oscillator, chain: Chain, z: Array, n: int) -> Array:
-    """States (x1, x2) at n times evenly spread over a closed chain with the unknowns z, [n, 2]."""
+def sampled_chain(
+    osc: Oscillator, chain: Chain, z: Array, n: int, since_beginning: Array | None = None
+) -> Array:
+    """States (x1, x2) at n times evenly spread over a closed chain with the unknowns z, [n, 2].
+
+    since_beginning: see `ClosedMotion`.
+    """
     durations = z[:, -1]
     ends = jnp.cumsum(durations)
 
@@ -84,4 +95,7 @@ def sampled_chain(osc: Oscillator, chain: Chain, z: Array, n: int) -> Array:
         since = t - ends[i] + durations[i]
         return flow(osc, chain.codes[i], chain.mesh[i], z[i, :-1], since)[:2]
 
-    return jax.vmap(at)(jnp.linspace(0.0, 1.0, n) * ends[-1])
+    times = jnp.linspace(0.0, 1.0, n) * ends[-1]
+    if since_beginning is not None:
+        times = (times + since_beginning) % ends[-1]
+    return jax.vmap(at)(times)

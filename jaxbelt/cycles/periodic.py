@@ -25,7 +25,7 @@ from ..checks import (
 )
 from ..model.events import signature_name
 from ..model.modes import STUCK
-from ..model.oscillator import Oscillator, check_clock, check_oscillator
+from ..model.oscillator import Oscillator, check_clock, check_oscillator, has_possible_numbers
 from ..model.own_units import in_given_units, in_own_units, quantity
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
@@ -130,6 +130,13 @@ class PeriodicMotion(ClosedMotion):
         if self.chain.share is None:
             return self.unknowns[..., 0, :2]
         return _first_state(_at_phase_0(self))
+
+    @property
+    def since_beginning(self) -> Array | None:
+        share = self.chain.share
+        if share is None:
+            return None
+        return (1.0 - share) * forcing_period(self.oscillator, self.chain.turns)
 
     @property
     def starts(self) -> Array:
@@ -282,6 +289,7 @@ def _polished_motion(
     fine = (residual < HOLDS) & (settled < KNOWN_MOTION) & (error <= most)
     status = jnp.where(fine, Status.OK.value, Status.NO_CONVERGENCE.value)
     status = jnp.where(always & (residual < HOLDS), Status.NEUTRAL.value, status)
+    status = jnp.where(has_possible_numbers(osc), status, Status.NOT_FINITE.value)
     return motion_at(osc, chain, z, residual, solved.iterations, status), error
 
 

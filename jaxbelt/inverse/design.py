@@ -229,7 +229,9 @@ def design(
         return cycle.start if isinstance(cycle, PeriodicMotion) else y0
 
     def off(achieved):
-        wanted = np.clip(achieved, *intervals.T)
+        # Where nothing is achieved a single value is wanted all the same.
+        single = np.where(np.ptp(intervals, axis=1) == 0, intervals[:, 0], np.nan)
+        wanted = np.where(np.isnan(achieved), single, np.clip(achieved, *intervals.T))
         return (achieved - wanted) / sizes, wanted
 
     def improved(slopes, miss, damping):

@@ -28,7 +28,7 @@ CAMPAIGNS = {
         name: name
         for name in (
             *("paths", "refine", "portraits", "shocks", "fractions", "maps", "steep"),
-            *("coverage", "slopes", "branches", "curves", "designs", "multipliers"),
+            *("coverage", "slopes", "branches", "phases", "curves", "designs", "multipliers"),
         )
     },
     "forced-sweep": "forced_sweeps",
@@ -41,7 +41,8 @@ KNOWN = {
     **dict.fromkeys(("paths", "refine", "portraits", "shocks"), PLAIN),
     "maps": frozenset(),
     **dict.fromkeys(
-        ("steep", "coverage", "slopes", "branches", "curves", "designs", "multipliers"), PLAIN
+        ("steep", "coverage", "slopes", "branches", "phases", "curves", "designs", "multipliers"),
+        PLAIN,
     ),
     "fractions": PLAIN | {"threads"},
     "forced-sweep": PLAIN | {"threads", "structure", "tol"},
