@@ -8,6 +8,7 @@ where the branch goes on with another signature: to the other side of the point,
 one. At a period doubling the other branch that meets this one there is followed, too.
 """
 
+import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -26,6 +27,7 @@ from ..cycles.periodic import (
     motion_at_unknowns,
     periodic_from,
     state_at_phase_0,
+    state_near_start,
 )
 from ..cycles.shooting import jacobian
 from ..model.events import of_one_loop
@@ -69,6 +71,8 @@ UNBOUNDED = 1e3
 WIDE_GAP, MOST_FURTHER = 0.02, 4
 #: How far beyond a point a motion with another signature is looked for, in parts of the span.
 BEYOND_POINT = (1e-5, 1e-4, 1e-3)
+#: Shares of a period at which it is looked for.
+PHASES_BEYOND = (0.0, 0.25, 0.5, 0.75)
 #: States that a branch reaches beyond a point are no farther than this from it.
 NEAR_POINT = 0.1
 #: Of two motions that follow one another the way between them is straight up to this part.
@@ -460,21 +464,23 @@ def _beyond_point(
     direction: the sign is that in which the parameter went."""
     if _jumps_at(point):
         return None
-    direction = float(np.sign(direction))
-    at, value = np.asarray(point.cycle.start), float(point.value)
-    periods = last.motion.periods
-    moved = at - np.asarray(last.motion.start)
-    for side in (1.0, -1.0):
-        for part in BEYOND_POINT:
-            there = value + side * direction * part * line.length
-            if not line.first <= there <= line.last:
-                continue
+    direction, value = float(np.sign(direction)), float(point.value)
+    periods, start = last.motion.periods, np.asarray(point.cycle.start)
+    # Between a guess and the next phase 0 its error may grow a thousandfold.
+    for share, side, part in itertools.product(PHASES_BEYOND, (1.0, -1.0), BEYOND_POINT):
+        at, before = (
+            state_near_start(line.at(where), motion, share)
+            for where, motion in ((value, point.cycle), last[:2])
+        )
+        there = value + side * direction * part * line.length
+        if line.first <= there <= line.last:
             osc = line.at(there)
             own = last.motion.at(osc) if side < 0 else None
             for stretch in (0.0, part, -part):
-                motion = periodic_from(osc, at + stretch * moved, periods, line.turns)
+                guess = at + stretch * (at - before)
+                motion = periodic_from(osc, guess, periods, line.turns, share)
                 fine = int(motion.status) == Status.OK and motion.periods == periods
-                if not fine or np.max(np.abs(np.asarray(motion.start) - at)) > NEAR_POINT:
+                if not fine or np.max(np.abs(np.asarray(motion.start) - start)) > NEAR_POINT:
                     continue
                 row = MotionRow(there, motion)
                 # Beyond the point the signature that has ended may still solve, by rounding.

@@ -344,14 +344,16 @@ def states_at_phase(osc: Oscillator, chain: TimedChain, z: Array, phase: Array) 
     begins = 0.0 if chain.share is None else chain.share
     t = forcing_period(osc, chain.turns) * jnp.where(phase < begins, phase + 1, phase)
 
-    def one(osc, t, codes, is_last, mesh, unknown, following):
-        passes = lax.stop_gradient((unknown[2] <= t) & (is_last | (following > t)))
+    def one(osc, t, codes, is_first, is_last, mesh, unknown, following):
+        # Where a period begins t is known up to rounding.
+        passes = (is_first | (unknown[2] <= t)) & (is_last | (following > t))
         since = jnp.where(passes, t - unknown[2], 0.0)
         state = flow(osc, codes, mesh, unknown[:3], since)[:2]
         return jnp.where(passes, state, jnp.nan)
 
     is_last = chain.ends == Ends(len(osc.belts)).period
-    columns = chain.codes, is_last, chain.mesh, z, after_each(chain, z[:, 2])
+    is_first = jnp.roll(is_last, 1).at[0].set(True)
+    columns = chain.codes, is_first, is_last, chain.mesh, z, after_each(chain, z[:, 2])
     found = arc_by_arc(one)((osc, t), columns)
     return jnp.where(chain.used[:, None], found, jnp.nan)
 

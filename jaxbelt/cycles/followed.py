@@ -105,5 +105,6 @@ def after_period(osc: Oscillator, followed: Followed) -> np.ndarray:
     """The last state, from which to go on, exactly on the belt that the mass sticks to."""
     x1, x2 = followed.starts[-1].tolist()
     mode = mode_of(jnp.asarray(followed.codes[-1]))
-    velocity = stick_velocity(at_time(osc, jnp.zeros(())), mode, osc.omega * x2)
+    began = at_time(osc, jnp.asarray(followed.entries[0, 2]))
+    velocity = stick_velocity(began, mode, osc.omega * x2)
     return np.array([x1, float(velocity / osc.omega)])

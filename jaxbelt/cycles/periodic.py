@@ -143,7 +143,9 @@ class PeriodicMotion(ClosedMotion):
         """The states (x1, x2) at the phase 0 of each of its periods, [periods, 2]."""
         if self.chain.share is not None:
             states = _at_phase_0(self)
-            return states[np.flatnonzero(np.isfinite(np.asarray(states[:, 0])))]
+            passes = np.flatnonzero(np.isfinite(np.asarray(states[:, 0])))
+            # Without a motion as many as it has periods.
+            return states[passes if passes.size else np.arange(self.periods)]
         cuts = np.flatnonzero(np.asarray(self.chain.ends) == self._ends.period)
         return self.unknowns[jnp.asarray(np.append(0, cuts[:-1] + 1)), :2]
 
@@ -359,10 +361,10 @@ def _without_doubles(osc: Oscillator, motion: PeriodicMotion) -> PeriodicMotion:
 
 def begun_off_events(osc: Oscillator, motion: PeriodicMotion) -> PeriodicMotion:
     """The motion with a chain that begins where no event is near: in the middle of the longest time
-    between any two phases with events. As it is where that is hardly farther from them, or where
-    following the motion from there does not lead to it.
+    between any two phases with events, before the phase 0 of `motion.start`.
 
-    osc: its oscillator, known, in own units.
+    As it is where that is hardly farther from events, or where following the motion from there does
+    not lead to it. osc: its oscillator, known, in own units.
     """
     chain, z = motion.chain, np.asarray(motion.unknowns)
     period = float(forcing_period(osc, chain.turns))
@@ -378,14 +380,28 @@ def begun_off_events(osc: Oscillator, motion: PeriodicMotion) -> PeriodicMotion:
     off = np.abs(phases - begins)
     if np.min(np.minimum(off, 1 - off)) >= OFF_EVENTS * gaps[widest]:
         return motion
-    state = _first_state(_states_at_phase(osc, chain, motion.unknowns, jnp.asarray(share)))
-    followed = arcs_over(osc, np.asarray(state), chain.turns, share)
+    state = state_near_start(osc, motion, share, before=True)
+    followed = arcs_over(osc, state, chain.turns, share)
     if len(followed.starts) <= motion.periods:
         return motion
     loop = followed.first(motion.periods).loop()
     found = solved_from(osc, loop, chain.turns, jnp.asarray(share))
     same = int(found.status) == Status.OK and is_same_motion(found, motion)
     return found if same else motion
+
+
+def state_near_start(
+    osc: Oscillator, motion: PeriodicMotion, share: float, *, before: bool = False
+) -> np.ndarray:
+    """The state of a motion at a share of a period, the first one after `motion.start`, or the last
+    one before it."""
+    chain = motion.chain
+    states = np.asarray(_states_at_phase(osc, chain, motion.unknowns, jnp.asarray(share)))
+    passes = np.flatnonzero(np.isfinite(states[:, 0]))
+    # Whether the first of them is before the first phase 0 of the chain.
+    is_first = chain.share is not None and share >= float(chain.share)
+    place = (0 if is_first else -1) if before else int(is_first) % len(passes)
+    return states[passes[place]]
 
 
 def periods_of(chain: TimedChain) -> int:
@@ -419,26 +435,33 @@ def nothing_found(osc: Oscillator, turns: int, status: int) -> PeriodicMotion:
     return PeriodicMotion(osc, chain, none, found, nan, jnp.asarray(0), jnp.asarray(status))
 
 
-def periodic_from(osc: Oscillator, guess: Any, periods: int, turns: int) -> PeriodicMotion:
-    """What `periodic` returns, of a known oscillator in its own units."""
+def periodic_from(
+    osc: Oscillator, guess: Any, periods: int, turns: int, share: float = 0.0
+) -> PeriodicMotion:
+    """What `periodic` returns, of a known oscillator in its own units.
+
+    share: of a period, at which the guess is; the motion's chain begins there.
+    """
     y = np.asarray(guess, float)
     motion, begun_again = None, False
+    begins = jnp.asarray(share) if share else None
     for _ in range(OUTER_STEPS):
-        followed = arcs_over(osc, y, turns)
+        followed = arcs_over(osc, y, turns, share)
         if len(followed.starts) <= periods:
             status = followed.status or Status.NOT_FINITE.value
             return motion or nothing_found(osc, turns, int(status))
         followed = followed.first(periods)
-        motion = solved_from(osc, followed.loop(), turns)
+        motion = solved_from(osc, followed.loop(), turns, begins)
         if int(motion.status) in (Status.OK, Status.NEUTRAL):
             goes_on = np.array_equal(followed.codes[0], followed.codes[-1])
             if goes_on or begun_again:
                 return _of_least_periods(osc, motion, turns)
             # It begins in another mode than it ends in: an arc of no duration is before an event.
-            y = after_period(osc, followed._replace(starts=np.asarray(motion.start)[None]))
+            begun = np.asarray(motion.unknowns)[:1, :2]
+            y = after_period(osc, followed._replace(starts=begun))
             begun_again = True
             continue
-        change = _period_step(osc, followed, turns)
+        change = _period_step(osc, followed, turns, begins)
         size = float(np.max(np.abs(change)))
         if not 0 < size < np.inf:
             break
@@ -446,11 +469,13 @@ def periodic_from(osc: Oscillator, guess: Any, periods: int, turns: int) -> Peri
     return motion if motion is not None else nothing_found(osc, turns, Status.NO_CONVERGENCE)
 
 
-def _period_step(osc: Oscillator, followed: Followed, turns: int) -> np.ndarray:
-    """How far the state at the phase 0 is from that of a periodic motion, by Newton's method along
-    the orbit as it was followed."""
+def _period_step(
+    osc: Oscillator, followed: Followed, turns: int, begins: Array | None
+) -> np.ndarray:
+    """How far the state where periods begin is from that of a periodic motion, by Newton's method
+    along the orbit as it was followed."""
     loop = followed.loop()
-    chain, z = _timed_chain_of(osc, loop, least_steps(osc, loop), turns)
+    chain, z = _timed_chain_of(osc, loop, least_steps(osc, loop), turns, begins)
     matrix = np.asarray(_monodromy_of(osc, chain, z))
     miss = followed.starts[-1] - followed.starts[0]
     if not np.all(np.isfinite(matrix)):
