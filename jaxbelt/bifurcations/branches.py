@@ -9,7 +9,7 @@ one. At a period doubling the other branch that meets this one there is followed
 """
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -71,8 +71,8 @@ UNBOUNDED = 1e3
 WIDE_GAP, MOST_FURTHER = 0.02, 4
 #: How far beyond a point a motion with another signature is looked for, in parts of the span.
 BEYOND_POINT = (1e-5, 1e-4, 1e-3)
-#: Shares of a period at which it is looked for.
-PHASES_BEYOND = (0.0, 0.25, 0.5, 0.75)
+#: Shares of a period at which motions are looked for.
+SOME_PHASES = (0.0, 0.25, 0.5, 0.75)
 #: States that a branch reaches beyond a point are no farther than this from it.
 NEAR_POINT = 0.1
 #: Of two motions that follow one another the way between them is straight up to this part.
@@ -251,6 +251,7 @@ def _side_of_point(
         if not isinstance(further, tuple):
             return MotionBranch(rows, [further]), points
         new, sign = further
+        points += _points_before(line, new, found)
         rows.append(new)
     return MotionBranch(rows, [rows[-1].value]), points
 
@@ -282,8 +283,12 @@ def _branch_leg(
             return rows, points, last.value
         if not line.first <= new.value <= line.last:
             end = line.first if new.value < line.first else line.last
-            rows += _at_end(leg, u, solved.u, end, line)
-            return rows, points, None
+            at_end = _at_end(leg, u, solved.u, end, line)
+            if at_end is None:
+                step, straight = 0.5 * step, 0
+                continue
+            points += list(_points_between(line, last, at_end))
+            return [*rows, at_end], points, None
         doubling = _doubling_between(line, last, new)
         if doubling is not None:
             return rows, [*points, doubling], None
@@ -322,11 +327,13 @@ def _branch_leg(
 
 def _at_end(
     leg: MotionLeg, u: np.ndarray, beyond: np.ndarray, end: float, line: ForcedLine
-) -> list[MotionRow]:
+) -> MotionRow | None:
+    """The motion at an end of the span, between two points of a leg; None where its signature has
+    ended before."""
     part = (end / line.length - u[-1]) / (beyond[-1] - u[-1])
     solved = leg.corrected(u + part * (beyond - u), np.eye(u.size)[-1], 0.0)
     row = leg.row(solved.u) if solved.found else None
-    return [row] if row is not None and int(row.motion.status) == Status.OK else []
+    return row if row is not None and int(row.motion.status) == Status.OK else None
 
 
 # --- points ---------------------------------------------------------------------------------------
@@ -353,6 +360,19 @@ def _points_between(
         start = np.asarray(other.motion.start)
         fine = [p for p in found if _is_between(line, p, one, other.value, start)]
         yield from fine[:1]
+
+
+def _points_before(
+    line: ForcedLine, row: MotionRow, borders: Sequence[BifurcationPoint]
+) -> list[BifurcationPoint]:
+    """The points of multipliers between a point in which a signature ended, the last of some, and
+    the first motion with the next one, which may be some way off."""
+    value = float(borders[-1].value) if borders else np.inf
+    if abs(row.value - value) > 2 * max(BEYOND_POINT) * line.length:
+        return []
+    low, high = sorted((value, row.value))
+    found = (point for kind in _tests(row.motion) for point in _points(line, kind(), row))
+    return [point for point in found if low < float(point.value) < high]
 
 
 def _points(
@@ -467,7 +487,7 @@ def _beyond_point(
     direction, value = float(np.sign(direction)), float(point.value)
     periods, start = last.motion.periods, np.asarray(point.cycle.start)
     # Between a guess and the next phase 0 its error may grow a thousandfold.
-    for share, side, part in itertools.product(PHASES_BEYOND, (1.0, -1.0), BEYOND_POINT):
+    for share, side, part in itertools.product(SOME_PHASES, (1.0, -1.0), BEYOND_POINT):
         at, before = (
             state_near_start(line.at(where), motion, share)
             for where, motion in ((value, point.cycle), last[:2])
@@ -511,20 +531,19 @@ def _other_branch(
 
 def _leaving(line: ForcedLine, point: BifurcationPoint) -> MotionRow | None:
     """A motion of twice the period beside a period doubling."""
-    at, value = np.asarray(point.cycle.start), float(point.value)
-    periods = 2 * point.cycle.periods
-    for size in LEAVES:
-        for side in (1.0, -1.0):
-            there = value + side * size**2 * line.length
-            if not line.first <= there <= line.last:
-                continue
-            osc = line.at(there)
-            for angle in np.linspace(0, np.pi, 4, endpoint=False):
-                guess = at + size * np.array([np.cos(angle), np.sin(angle)])
-                motion = periodic_from(osc, guess, periods, line.turns)
-                row = MotionRow(there, motion)
-                fine = int(motion.status) == Status.OK and motion.periods == periods
-                # Too near to the point the equations are singular.
-                if fine and MotionLeg.begun(line, row)[1].found:
-                    return row
+    value, periods = float(point.value), 2 * point.cycle.periods
+    for share, size, side in itertools.product(SOME_PHASES, LEAVES, (1.0, -1.0)):
+        at = state_near_start(line.at(value), point.cycle, share)
+        there = value + side * size**2 * line.length
+        if not line.first <= there <= line.last:
+            continue
+        osc = line.at(there)
+        for angle in np.linspace(0, np.pi, 4, endpoint=False):
+            guess = at + size * np.array([np.cos(angle), np.sin(angle)])
+            motion = periodic_from(osc, guess, periods, line.turns, share)
+            row = MotionRow(there, motion)
+            fine = int(motion.status) == Status.OK and motion.periods == periods
+            # Too near to the point the equations are singular.
+            if fine and MotionLeg.begun(line, row)[1].found:
+                return row
     return None
