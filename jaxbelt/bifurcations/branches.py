@@ -79,6 +79,9 @@ NEAR_POINT = 0.1
 STRAIGHT_WAY = 0.1
 #: States of a motion half of its periods later that differ by less: a period doubling is near.
 ALIKE_HALVES = 0.03
+#: Multipliers of two motions beside a point at which only the order of events changes differ by
+#: less, over 1 and their size.
+ALIKE_MULTIPLIERS = 0.1
 #: How far along the direction that a period doubling shows the motion that leaves is looked for.
 LEAVES = (1e-3, 1e-2, 5e-2)
 
@@ -322,6 +325,9 @@ def _branch_leg(
         point = _border(line, near, last, value, start)
         if point is not None:
             return rows, [*points, point], _beyond_point(line, last, point, tangent[-1])
+        further = _past_corner(line, last, value, start)
+        if further is not None:
+            return rows, points, (further, float(np.sign(value - last.value)))
     return rows, points, last.value
 
 
@@ -453,6 +459,25 @@ def _past_phase(
     apart = np.max(np.abs(start - np.asarray(last.motion.start)))
     away = np.max(np.abs(np.asarray(motion.start) - start))
     return MotionRow(value, motion) if events in turns and away <= apart else None
+
+
+def _past_corner(
+    line: ForcedLine, last: MotionRow, value: float, start: np.ndarray
+) -> MotionRow | None:
+    """The motion at a value near to a state at the phase 0, if it is as near to that as the last
+    one, and has nearly its multipliers: two events have come together, as a contact edge and slip
+    onset, and nothing but their order has changed."""
+    if not line.first <= value <= line.last:
+        return None
+    motion = periodic_from(line.at(value), start, last.motion.periods, line.turns)
+    if int(motion.status) != Status.OK or motion.periods != last.motion.periods:
+        return None
+    found, before = np.asarray(motion.multipliers), np.asarray(last.motion.multipliers)
+    alike = np.max(np.abs(found - before)) < ALIKE_MULTIPLIERS * (1 + np.max(np.abs(before)))
+    apart = np.max(np.abs(start - np.asarray(last.motion.start)))
+    away = np.max(np.abs(np.asarray(motion.start) - start))
+    row = MotionRow(value, motion)
+    return row if alike and away <= apart and MotionLeg.begun(line, row)[1].found else None
 
 
 def _borders(line: ForcedLine, row: MotionRow) -> list[BifurcationPoint]:
