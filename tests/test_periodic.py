@@ -724,6 +724,24 @@ def test_the_derivative_of_a_start_of_a_chain_that_begins_elsewhere():
     np.testing.assert_allclose(slope, differences, rtol=1e-5, atol=1e-5)
 
 
+def test_motions_beside_where_an_event_passes_the_phase_0():
+    frequencies = jnp.linspace(1.2, 1.26, 7)
+
+    def largest(phase):
+        motion = jb.find_cycle(stribeck(1.2, phase), (0.4, -0.2))
+        found = jax.vmap(lambda f: motion.at(stribeck(f, phase)))(frequencies)
+        assert np.all(np.asarray(found.status) == OK)
+        last = motion.at(stribeck(1.26, phase))
+        assert float(last.x1_max) == pytest.approx(float(found.x1_max[-1]), abs=1e-10)
+        return found.x1_max, found.start
+
+    (highest, starts), (others, _) = largest(0.0), largest(0.5)
+    np.testing.assert_allclose(highest, others, atol=1e-10)
+    osc = stribeck(1.26, 0.0)
+    run = jb.simulate(osc, starts[-1], 2 * np.pi / 1.26)
+    np.testing.assert_allclose(run.ys[-1], starts[-1], atol=1e-8)
+
+
 def test_the_error_of_an_exponent_is_no_less_than_rounding():
     """Without damping and load both exponents are zero."""
     belt = jb.Belt(0.3, jb.Coulomb(1.0, 1.0), 0.0)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 #: Blocks of periods whose means tell the standard errors.
 BLOCKS = 25
 #: What steps of integration leave in an exponent, per period, where all periods are alike.
-LEAST_ERROR = 1e-12
+LEAST_STANDARD_ERROR = 1e-12
 
 
 class Exponents(eqx.Module):
@@ -196,7 +196,7 @@ def _averaged(logs, sticks, status, periods, period, end) -> Exponents:
             errors = np.std(blocks, axis=0, ddof=1) / np.sqrt(BLOCKS)
         if sticks:
             means[1] = -np.inf
-        errors = np.where(np.isfinite(means), np.maximum(errors, LEAST_ERROR), 0.0)
+        errors = np.where(np.isfinite(means), np.maximum(errors, LEAST_STANDARD_ERROR), 0.0)
         order = np.argsort(-means)
         means, errors = means[order], errors[order]
     return Exponents(

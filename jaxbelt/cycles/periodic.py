@@ -26,9 +26,9 @@ from ..checks import (
 from ..model.events import signature_name
 from ..model.modes import STUCK
 from ..model.oscillator import Oscillator, check_clock, check_oscillator, has_possible_numbers
-from ..model.own_units import in_given_units, in_own_units, quantity
+from ..model.own_units import OwnOscillator, in_given_units, in_own_units, quantity, rescaled
 from ..motion.arcs import Ends
-from ..numerics.compiling import jit
+from ..numerics.compiling import is_outermost, jit
 from ..numerics.implicit import solution
 from ..numerics.newton import HOLDS, solve
 from ..results import Status, describe, draw
@@ -188,14 +188,34 @@ class PeriodicMotion(ClosedMotion):
         """
         check_oscillator(osc)
         own = in_own_units(osc)
+        is_single = self.unknowns.ndim == 2
+        if is_concrete((own, self)) and is_single:
+            found = motion_at_unknowns(own, *self._guess_for(osc, own))
+            if int(found.status) == Status.NOT_ADMISSIBLE:
+                moved = self._begun_off_events()
+                if moved is not self:
+                    found = motion_at_unknowns(own, *moved._guess_for(osc, own))
+            return in_given_units(found, osc, own)
+        # Of many oscillators an event may pass the phase 0 in some.
+        known = self._begun_off_events() if is_single and is_outermost(self) else self
+        found, _ = _polished_motion(own, *known._guess_for(osc, own), jnp.asarray(HOLDS))
+        return in_given_units(found, osc, own)
+
+    def _guess_for(self, osc: Oscillator, own: OwnOscillator) -> tuple[TimedChain, Array]:
+        """Its chain, and its unknowns in the own units of an oscillator."""
         z = self.unknowns
         if own is not osc:
             z = jnp.concatenate([own.units.into(z[..., :2]), z[..., 2:]], axis=-1)
-        z = lax.stop_gradient(z)
-        if is_concrete((own, self)) and z.ndim == 2:
-            return in_given_units(motion_at_unknowns(own, self.chain, z), osc, own)
-        found, _ = _polished_motion(own, self.chain, z, jnp.asarray(HOLDS))
-        return in_given_units(found, osc, own)
+        return self.chain, lax.stop_gradient(z)
+
+    def _begun_off_events(self) -> "PeriodicMotion":
+        """See `begun_off_events`."""
+        own = in_own_units(self.oscillator)
+        if own is self.oscillator:
+            return begun_off_events(own, self)
+        motion = rescaled(self, 1 / own.units.length, lambda _: own)
+        moved = begun_off_events(own, motion)
+        return self if moved is motion else in_given_units(moved, self.oscillator, own)
 
     def row(self) -> dict[str, Any]:
         """What `table` tells of it."""
@@ -265,7 +285,7 @@ _extrema = jit(extrema_along)
 
 def _at_phase_0(motion: PeriodicMotion) -> Array:
     """The states of the arcs of a motion, or of each of a batch, at the phase 0, [..., arcs, 2]."""
-    function = _states_at_phase
+    function = _passing_states
     for _ in range(motion.unknowns.ndim - 2):
         function = jax.vmap(function, in_axes=(0, 0, 0, None))
     return function(motion.oscillator, motion.chain, motion.unknowns, jnp.zeros(()))
@@ -396,7 +416,7 @@ def state_near_start(
     """The state of a motion at a share of a period, the first one after `motion.start`, or the last
     one before it."""
     chain = motion.chain
-    states = np.asarray(_states_at_phase(osc, chain, motion.unknowns, jnp.asarray(share)))
+    states = np.asarray(_passing_states(osc, chain, motion.unknowns, jnp.asarray(share)))
     passes = np.flatnonzero(np.isfinite(states[:, 0]))
     # Whether the first of them is before the first phase 0 of the chain.
     is_first = chain.share is not None and share >= float(chain.share)
@@ -410,14 +430,14 @@ def periods_of(chain: TimedChain) -> int:
     return int(np.max(np.sum(is_end, axis=-1)))
 
 
-_states_at_phase = jit(states_at_phase)
+_passing_states = jit(states_at_phase)
 
 
 def state_at_phase_0(osc: Oscillator, chain: TimedChain, z: Array) -> np.ndarray:
     """The state at the phase 0 of unknowns of a chain, whether they solve its equations or not."""
     if chain.share is None:
         return np.asarray(z)[0, :2]
-    return np.asarray(_first_state(_states_at_phase(osc, chain, z, jnp.zeros(()))))
+    return np.asarray(_first_state(_passing_states(osc, chain, z, jnp.zeros(()))))
 
 
 def _first_state(states: Array) -> Array:
