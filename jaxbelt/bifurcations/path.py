@@ -100,6 +100,7 @@ class ParameterPath:
         #: In own units, the parameter too, like everything that follows.
         ends = np.array([[0.5 * (first + last)], [first], [last]])
         self.variation = given.in_own_units(*ends)
+        self._oscillators: dict[float, Oscillator] = {}
         self._idle: dict[float, np.ndarray] = {}
         measured = 1.0 if given.units is not None else float(self.variation.own.parameters[0])
         self.first, self.last = first / measured, last / measured
@@ -136,11 +137,13 @@ class ParameterPath:
         return end + CLOSE * (middle - end) if vanishes else end
 
     def at(self, value: float) -> Oscillator:
-        """The oscillator at a value."""
-        return self.variation.oscillator(np.array([value]))
+        """The oscillator at a value, made once."""
+        if value not in self._oscillators:
+            self._oscillators[value] = self.variation.oscillator(np.array([value]))
+        return self._oscillators[value]
 
     def idle(self, value: float) -> np.ndarray:
-        """See `idle_belts`; made once."""
+        """See `idle_belts`; known of a labelled value without its oscillator."""
         if value not in self._idle:
             self._idle[value] = idle_belts(self.at(value))
         return self._idle[value]
@@ -326,8 +329,8 @@ class ParameterPath:
     def _name(self, value: float) -> None:
         """The label at a value with its cycles."""
         cycles = sorted(self.cycles[value], key=lambda one: one.path)
-        loops, osc = [one.loop for one in cycles if one.path], self.at(value)
-        marks = tuple(condition.mark(osc, loops) for condition in self.conditions)
+        loops = [one.loop for one in cycles if one.path]
+        marks = tuple(condition.mark(self.at(value), loops) for condition in self.conditions)
         paths = tuple(one.path for one in cycles)
         self.labels[value] = self.labels[value]._replace(cycles=paths, marks=marks)
 

@@ -54,8 +54,6 @@ VALUES_SEEN, MERGED = 257, 1e-7
 #: A function whose tangent was asked for more often is compiled, which takes a few tenths of a
 #: second; uncompiled that of a machine in SI units takes some 20 ms.
 OFTEN = 64
-#: Oscillators of a variation that are kept, before all of them are forgotten.
-MOST_KNOWN = 4096
 #: Guesses along each side of a plane for where an oscillator lies in it.
 GUESSES = 9
 
@@ -199,23 +197,8 @@ class Variation:
             self.tangents[place] = tangent(np.asarray(values))
         return self.tangents[place]
 
-    @functools.cached_property
-    def _made(self) -> dict[tuple[float, ...], Oscillator]:
-        """Oscillators that were asked for, by their values."""
-        return {}
-
     def oscillator(self, values: Any) -> Oscillator:
         """The oscillator at these values, [k]; whether it is a possible one is not asked."""
-        if not is_concrete(values):
-            return self._oscillator(values)
-        row = tuple(np.asarray(values).tolist())
-        if row not in self._made:
-            if len(self._made) >= MOST_KNOWN:
-                self._made.clear()
-            self._made[row] = self._oscillator(values)
-        return self._made[row]
-
-    def _oscillator(self, values: Any) -> Oscillator:
         if self.line is not None:
             return self.line.at(values)
         row = tuple(np.asarray(values).tolist()) if is_concrete(values) else None
