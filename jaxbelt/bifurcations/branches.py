@@ -9,7 +9,7 @@ one. At a period doubling the other branch that meets this one there is followed
 """
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -60,8 +60,8 @@ SEARCH_AGAIN = 2e-3
 STRAIGHT_ROWS = 3
 #: Cosine of the largest angle between tangents of neighbours.
 STRAIGHT_BRANCH = 0.95
-#: Where the parameter's part of the tangent is larger its sign is that of the way along the branch.
-SLANTED = 0.01
+#: How far along a tangent the state at the phase 0 is compared.
+SHORT_WAY = 1e-6
 #: Steps on each side at most.
 MOST_MOTIONS = 400
 #: So many times as large as the first motion of a branch, and 1, a motion grows beyond all bounds.
@@ -79,8 +79,8 @@ NEAR_POINT = 0.1
 STRAIGHT_WAY = 0.1
 #: States of a motion half of its periods later that differ by less: a period doubling is near.
 ALIKE_HALVES = 0.03
-#: Multipliers of two motions beside a point at which only the order of events changes differ by
-#: less, over 1 and their size.
+#: Multipliers of two motions, between which events change and nothing else happens, differ by less,
+#: over 1 and their size.
 ALIKE_MULTIPLIERS = 0.1
 #: How far along the direction that a period doubling shows the motion that leaves is looked for.
 LEAVES = (1e-3, 1e-2, 5e-2)
@@ -205,21 +205,26 @@ class MotionLeg(NamedTuple):
         return MotionRow(value, motion_at_unknowns(self.line.at(value), self.chain, z))
 
     def going_on(
-        self, row: MotionRow, tangent: np.ndarray
+        self, row: MotionRow, u: np.ndarray, tangent: np.ndarray
     ) -> tuple["MotionLeg", np.ndarray, np.ndarray]:
         """The leg in the sizes of a row of it, and with the row's steps of integration; the row's
         unknowns, and the tangent, in these sizes. Where an event has come near to the phase at
-        which the chain begins, another one takes its place."""
-        if abs(tangent[-1]) > SLANTED:
-            motion = begun_off_events(self.line.at(row.value), row.motion)
-            if motion is not row.motion:
-                leg, begun = MotionLeg.begun(self.line, row._replace(motion=motion))
-                if begun.found and abs(begun.tangent[-1]) > SLANTED:
-                    along = np.sign(tangent[-1] * begun.tangent[-1]) * begun.tangent
-                    return leg, begun.u, along
+        which the chain begins, it begins at another one."""
+        moved = row._replace(motion=begun_off_events(self.line.at(row.value), row.motion))
+        if moved.motion is not row.motion:
+            leg, begun = MotionLeg.begun(self.line, moved)
+            if begun.found:
+                same = leg._course(begun.u, begun.tangent) @ self._course(u, tangent) > 0
+                return leg, begun.u, begun.tangent if same else -begun.tangent
         leg, u = MotionLeg.of(self.line, row)
         tangent = tangent * np.append(np.asarray(leg.weights / self.weights), 1.0)
         return leg, u, tangent / np.linalg.norm(tangent)
+
+    def _course(self, u: np.ndarray, tangent: np.ndarray) -> np.ndarray:
+        """How the state at the phase 0 and the parameter change along a tangent, wherever the chain
+        begins, [3]."""
+        ahead = u + SHORT_WAY * tangent
+        return np.append(self.start(ahead) - self.start(u), ahead[-1] - u[-1])
 
     def start(self, u: np.ndarray) -> np.ndarray:
         """The state at the phase 0, also of what is no motion."""
@@ -254,7 +259,6 @@ def _side_of_point(
         if not isinstance(further, tuple):
             return MotionBranch(rows, [further]), points
         new, sign = further
-        points += _points_before(line, new, found)
         rows.append(new)
     return MotionBranch(rows, [rows[-1].value]), points
 
@@ -298,13 +302,15 @@ def _branch_leg(
         if int(new.motion.status) != Status.OK:
             start = leg.start(solved.u)
             if step < SEARCH_AGAIN * searched:
-                turned = _past_phase(line, last, new.value, start)
-                if turned is not None:
-                    return rows, points, (turned, float(np.sign(new.value - last.value)))
                 borders, searched = _borders(line, last), step
             point = _border(line, borders, last, new.value, start)
             if point is not None:
-                return rows, [*points, point], _beyond_point(line, last, point, tangent[-1])
+                between = _points_between(line, last, MotionRow(float(point.value), point.cycle))
+                return (
+                    rows,
+                    [*points, *between, point],
+                    _beyond_point(line, last, point, tangent[-1]),
+                )
             step, straight = 0.5 * step, 0
             continue
         points += list(_points_between(line, last, new))
@@ -314,7 +320,7 @@ def _branch_leg(
         straight += 1
         # Towards a border steps become shorter and shorter.
         step = min(LONGEST_STEP_OF_BRANCH, 1.5 * step) if straight > STRAIGHT_ROWS else step
-        leg, u, tangent = leg.going_on(new, solved.tangent)
+        leg, u, tangent = leg.going_on(new, solved.u, solved.tangent)
         last = new
     if len(rows) < MOST_MOTIONS:
         # Newton's method may fail before the signature ends.
@@ -324,7 +330,8 @@ def _branch_leg(
         near = [p for p in _borders(line, last) if abs(float(p.value) - last.value) < within]
         point = _border(line, near, last, value, start)
         if point is not None:
-            return rows, [*points, point], _beyond_point(line, last, point, tangent[-1])
+            between = _points_between(line, last, MotionRow(float(point.value), point.cycle))
+            return rows, [*points, *between, point], _beyond_point(line, last, point, tangent[-1])
         further = _past_corner(line, last, value, start)
         if further is not None:
             return rows, points, (further, float(np.sign(value - last.value)))
@@ -366,19 +373,6 @@ def _points_between(
         start = np.asarray(other.motion.start)
         fine = [p for p in found if _is_between(line, p, one, other.value, start)]
         yield from fine[:1]
-
-
-def _points_before(
-    line: ForcedLine, row: MotionRow, borders: Sequence[BifurcationPoint]
-) -> list[BifurcationPoint]:
-    """The points of multipliers between a point in which a signature ended, the last of some, and
-    the first motion with the next one, which may be some way off."""
-    value = float(borders[-1].value) if borders else np.inf
-    if abs(row.value - value) > 2 * max(BEYOND_POINT) * line.length:
-        return []
-    low, high = sorted((value, row.value))
-    found = (point for kind in _tests(row.motion) for point in _points(line, kind(), row))
-    return [point for point in found if low < float(point.value) < high]
 
 
 def _points(
@@ -444,29 +438,15 @@ def _apart(motion: PeriodicMotion) -> np.ndarray | None:
     return None if odd else starts - np.roll(starts, -half, axis=0)
 
 
-def _past_phase(
-    line: ForcedLine, last: MotionRow, value: float, start: np.ndarray
-) -> MotionRow | None:
-    """The motion at a value near to a state at the phase 0, if it has the events of the last one in
-    their order: then one of these has passed the phase 0, where chains begin."""
-    motion = periodic_from(line.at(value), start, last.motion.periods, line.turns)
-    if int(motion.status) != Status.OK or motion.periods != last.motion.periods:
-        return None
-    if np.array_equal(motion.chain.codes[0], last.motion.chain.codes[0]):
-        return None
-    events, before = motion.signature, last.motion.signature
-    turns = (before[k:] + before[:k] for k in range(max(1, len(before))))
-    apart = np.max(np.abs(start - np.asarray(last.motion.start)))
-    away = np.max(np.abs(np.asarray(motion.start) - start))
-    return MotionRow(value, motion) if events in turns and away <= apart else None
-
-
 def _past_corner(
     line: ForcedLine, last: MotionRow, value: float, start: np.ndarray
 ) -> MotionRow | None:
     """The motion at a value near to a state at the phase 0, if it is as near to that as the last
-    one, and has nearly its multipliers: two events have come together, as a contact edge and slip
-    onset, and nothing but their order has changed."""
+    one, and has nearly its multipliers.
+
+    Its events may be others: where a mass comes to a contact edge with the velocity of a belt, or
+    two belts have one velocity, they change, and the branch goes on.
+    """
     if not line.first <= value <= line.last:
         return None
     motion = periodic_from(line.at(value), start, last.motion.periods, line.turns)
