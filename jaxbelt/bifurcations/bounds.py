@@ -16,6 +16,7 @@ import numpy as np
 
 from ..activity import note_progress
 from ..model.variations import Variation
+from ..numerics.compiling import compiled_beside
 from ..numerics.continuation import Stop
 from ..numerics.widths import as_here
 from ..results import Status
@@ -23,7 +24,7 @@ from .base import BifurcationPoint
 from .curves import FAR, BifurcationCurve, follow_point, is_elsewhere
 from .faces import densely
 from .path import ParameterPath
-from .scan import search
+from .scan import calls_ahead, search
 from .special import SpecialPoint
 
 #: A curve bounds two neighbouring cells if it passes the line between them this near, in cells:
@@ -131,8 +132,10 @@ class Bounds:
         """Points on a line parallel to an axis, the other parameter being fixed."""
         span = float(ends[0]), float(ends[1])
         path = ParameterPath(self.variation.held(1 - along, fixed), None, span, basins=False)
-        # A short line is searched farther off, too.
-        return search(path, resolution, near=1.0) if resolution else search(path)
+        if resolution:  # a short line, which is searched farther off, too
+            return search(path, resolution, near=1.0)
+        with compiled_beside("scan", path.at(path.first), calls_ahead(path)):
+            return search(path)
 
     def _follow(
         self, points: Sequence[BifurcationPoint], along: int, fixed: float, source: str

@@ -12,7 +12,7 @@ unstable.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -31,6 +31,7 @@ from ..model.oscillator import Oscillator, has_clock
 from ..model.own_units import in_own_units, rescaled
 from ..model.parameters import leaf_index
 from ..model.variations import WITH_A_CLOCK, Variation, as_span, varied
+from ..numerics.compiling import compiled_beside
 from ..results import Status, draw
 from ..tables import per_belt, table_of
 from .base import BifurcationPoint, given_point
@@ -46,7 +47,7 @@ from .pieces import (
     nodes_of_stretch,
     separated_stretches,
 )
-from .scan import by_value, edges_touched, is_at_one_value, search
+from .scan import by_value, calls_ahead, edges_touched, is_at_one_value, search
 from .timed_systems import place_of_motion
 
 if TYPE_CHECKING:
@@ -180,7 +181,9 @@ def bifurcation_diagram(
     require_value(start is None, "start", "left out where there is no forcing", start)
     path = ParameterPath(osc, where, span)
     osc_at_first = path.at(path.first)
-    points = search(path, resolution, ahead=[lambda: from_starts(osc_at_first)])
+    ahead = chain(calls_ahead(path), [lambda: from_starts(osc_at_first)])
+    with compiled_beside("bifurcation_diagram", osc_at_first, ahead):
+        points = search(path, resolution)
     # A point on an end of the span has one side only; a condition that holds all along has none.
     bounds = [point for point in points if int(point.status) != Status.DEGENERATE]
     inner = [point for point in bounds if path.first < float(point.value) < path.last]

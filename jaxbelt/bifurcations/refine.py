@@ -6,6 +6,7 @@ search of `scan` is done on small intervals around the guess, from short to long
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -19,7 +20,7 @@ from ..cycles.cycle import warn_of_extrapolation
 from ..model.oscillator import Oscillator, check_oscillator, has_clock
 from ..model.parameters import leaf_index
 from ..model.variations import Variation, varied
-from ..numerics.compiling import is_outermost
+from ..numerics.compiling import compiled_beside, is_outermost
 from ..results import Status
 from .base import AbstractCondition, BifurcationPoint, given_point
 from .forced import forced_point
@@ -102,7 +103,10 @@ def refine(
     variation, near, value = _begun(condition, osc, where, at)
     if has_clock(near):
         return given_point(forced_point(condition, variation, value, start), variation)
-    point = condition.point(variation, near, value, room or condition.room)
+    with compiled_beside(
+        "refine", (near, value), [partial(_label_near, condition, variation, value)]
+    ):
+        point = condition.point(variation, near, value, room or condition.room)
     if not is_outermost(near, value, point):
         return given_point(point, variation)
     point = more_exact(_bracketed(point, variation, value), variation)
@@ -123,11 +127,9 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
         return point
     attempts, unexplained = 0, []
     for reach in (unit * each for each in REACHES):
-        ends = (guess + side * min(reach, away) for side in (-1, 1))
-        first, last = (_possible(variation, guess, end) for end in ends)
-        if not first < last:
+        path = _path_near(condition, variation, guess, min(reach, away))
+        if path is None:
             break
-        path = ParameterPath(variation, None, (first, last), [condition])
         # From farther off than in `scan`, as these paths are short.
         path.attempts = attempts
         searched = search(path, INTERVALS, near=1.0, known=unexplained)
@@ -143,7 +145,7 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
             or (isinstance(one.condition, type(condition)) and not condition.covers(one))
         ]
         values += [beside for value in values for beside in path.beside(value)]
-        within = (value for value in values if first <= value <= last)
+        within = (value for value in values if path.first <= value <= path.last)
         also = (condition.named_point_from(variation, value) for value in within)
         found += [one for one in also if one is not None]
         # Any of these may have led to a point that is farther away than others beyond the reach.
@@ -159,6 +161,22 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
         nearest = min(unexplained, key=lambda one: abs(float(one.value) - guess))
         return replace(point, sides=nearest.sides)
     return point
+
+
+def _path_near(
+    condition: AbstractCondition, variation: Variation, guess: float, reach: float
+) -> ParameterPath | None:
+    """The path up to `reach` on both sides of the guess, as far as there are oscillators."""
+    ends = (guess + side * reach for side in (-1, 1))
+    first, last = (_possible(variation, guess, end) for end in ends)
+    return ParameterPath(variation, None, (first, last), [condition]) if first < last else None
+
+
+def _label_near(condition: AbstractCondition, variation: Variation, value: Any) -> None:
+    """Labels the guess, for the program that `_bracketed` needs."""
+    path = _path_near(condition, variation, float(value[0]), REACHES[0])
+    if path is not None:
+        path.find_labels([float(value[0])])
 
 
 def _away(point: BifurcationPoint, guess: float) -> float:

@@ -15,7 +15,7 @@ import functools
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from itertools import chain, islice, pairwise, takewhile
+from itertools import islice, pairwise, takewhile
 from typing import Any
 
 import jax.numpy as jnp
@@ -124,7 +124,8 @@ def scan(
     """
     resolution = as_whole(resolution, "resolution")
     path = ParameterPath(osc, where, span, conditions)
-    points = search(path, resolution)
+    with compiled_beside("scan", path.at(path.first), calls_ahead(path)):
+        points = search(path, resolution)
     points = tuple(given_point(point, path.variation) for point in points)
     warn_of_extrapolation((point.cycle for point in points), depth=5)
     return points
@@ -134,40 +135,13 @@ def search(
     path: ParameterPath,
     resolution: int = 96,
     near: float = NEAR,
-    ahead: Sequence[Callable[[], Any]] = (),
     known: Sequence[BifurcationPoint] = (),
 ) -> tuple[BifurcationPoint, ...]:
     """Every bifurcation point on a path, in order; the path keeps its labels.
 
     near: points are solved for from the ends of intervals narrower than this fraction of the path.
-    ahead: calls for the programs that are needed afterwards, see `compiled_beside`.
     known: unexplained points of another path, which are not searched once more.
     """
-    calls = chain(_calls_ahead(path), ahead)
-    with compiled_beside(f"path {len(ahead)}", path.at(path.first), calls):
-        return _searched_interval(path, resolution, near, known)
-
-
-def _calls_ahead(path: ParameterPath) -> Iterator[Callable[[], Any]]:
-    """Calls that compile what nearly every path needs: of what happens to belts' velocities on this
-    one, of Hopf points, and of cycles that begin to stick."""
-    belts = len(path.at(path.first).belts)
-    loop, value = blank_loop(ROOM, belts), path.inside(path.first)
-    ahead: list[tuple[AbstractCondition, float]] = []
-    for at in path.breaks:
-        for pair in path.coinciding(at):
-            likely = (one for kind in LOOKED_FOR for one in kind.at_coincidence(pair))
-            ahead += [(one, at) for one in islice(likely, 1)]
-    ahead += [(Hopf(), value), (GrazingSliding(0), value)]
-    for condition, at in ahead:
-        is_of_cycle = isinstance(condition, AbstractCycleCondition)
-        beginning = loop if is_of_cycle else ANY if isinstance(condition, Hopf) else None
-        yield functools.partial(condition.point_from, path.variation, at, beginning)
-
-
-def _searched_interval(
-    path: ParameterPath, resolution: int, near: float, known: Sequence[BifurcationPoint]
-) -> tuple[BifurcationPoint, ...]:
     points = [point for at in path.breaks for point in _at_break(path, at)]
     first, last = path.inside(path.first), path.inside(path.last)
     ends = [first, *(v for at in path.breaks for v in path.beside(at)), last]
@@ -215,6 +189,23 @@ def _searched_interval(
     return by_value(points)
 
 
+def calls_ahead(path: ParameterPath) -> Iterator[Callable[[], Any]]:
+    """Calls that compile what nearly every path needs: of what happens to belts' velocities on this
+    one, of Hopf points, and of cycles that begin to stick."""
+    belts = len(path.at(path.first).belts)
+    loop, value = blank_loop(ROOM, belts), path.inside(path.first)
+    ahead: list[tuple[AbstractCondition, float]] = []
+    for at in path.breaks:
+        for pair in path.coinciding(at):
+            likely = (one for kind in LOOKED_FOR for one in kind.at_coincidence(pair))
+            ahead += [(one, at) for one in islice(likely, 1)]
+    ahead += [(Hopf(), value), (GrazingSliding(0), value)]
+    for condition, at in ahead:
+        is_of_cycle = isinstance(condition, AbstractCycleCondition)
+        beginning = loop if is_of_cycle else ANY if isinstance(condition, Hopf) else None
+        yield functools.partial(condition.point_from, path.variation, at, beginning)
+
+
 def _left(path: ParameterPath, intervals: Sequence[tuple[float, float]]) -> list[BifurcationPoint]:
     """Points for intervals that were not looked into, and a warning that says so."""
     unit = 1.0 if path.variation.units is None else float(path.variation.own.parameters[0])
@@ -223,7 +214,7 @@ def _left(path: ParameterPath, intervals: Sequence[tuple[float, float]]) -> list
         f"the search was left after {path.attempts} attempts of Newton's method; something changes "
         f"that was not looked into in {where}: see the points with the status INCOMPLETE, or ask "
         "of a shorter span",
-        stacklevel=5,
+        stacklevel=4,
     )
     middles = [(0.5 * (a + b), 0.5 * (b - a)) for a, b in intervals]
     return [_unsolved_point(path, *one, why=Status.INCOMPLETE) for one in middles]
