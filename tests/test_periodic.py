@@ -837,14 +837,3 @@ def test_a_branch_does_not_come_back_on_its_own_way(shift):
     # It turns at both folds, and at the grazing point at -0.855.
     assert np.sum(np.diff(np.sign(np.diff(values))) != 0) == 3
     assert values[-1] == span[1]
-
-
-@pytest.mark.slow
-def test_a_curve_of_period_doublings_ends_where_the_motion_begins_to_stick():
-    point = jb.refine(jb.PeriodDoubling(), jb.presets.di_bernardo, at=1.713)
-    curve = jb.bifurcation_curve(point, jb.presets.di_bernardo, ((1.6, 1.9), (0.02, 0.2)))
-    frequency, amplitude = curve.values.T
-    assert amplitude.max() == pytest.approx(0.2, abs=1e-12)
-    # There the curve of grazing of the motion of twice the period ends, too.
-    end = np.argmin(amplitude)
-    assert (frequency[end], amplitude[end]) == pytest.approx((1.6596, 0.0878), abs=2e-3)

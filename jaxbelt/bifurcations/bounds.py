@@ -21,11 +21,11 @@ from ..numerics.continuation import Stop
 from ..numerics.widths import as_here
 from ..results import Status
 from .base import BifurcationPoint
-from .curves import FAR, BifurcationCurve, follow_point, is_elsewhere
+from .curves import BifurcationCurve, follow_point
 from .faces import densely
 from .path import ParameterPath
 from .scan import calls_ahead, search
-from .special import SpecialPoint
+from .special import FAR, SpecialPoint, is_elsewhere
 
 #: A curve bounds two neighbouring cells if it passes the line between them this near, in cells:
 #: chords of a bent curve are off by less.

@@ -11,7 +11,7 @@ one. At a period doubling the other branch that meets this one there is followed
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,17 +37,16 @@ from ..model.variations import Variation
 from ..numerics.continuation import Corrected
 from ..results import Status
 from .base import AbstractCondition, BifurcationPoint
-from .crossings import CrossingSliding
 from .forced import (
     AbstractForcedCondition,
     AddingSliding,
     Fold,
     PeriodDoubling,
-    SwitchingSliding,
     Torus,
     friction_jumps,
     motion_between_halves,
 )
+from .forced_ends import borders_of
 from .systems import WEIGHT
 from .tangencies import GrazingSliding
 from .tracks import corrected_among
@@ -462,9 +461,8 @@ def _past_corner(
 
 def _borders(line: ForcedLine, row: MotionRow) -> list[BifurcationPoint]:
     """Points near to a motion in which its signature may end."""
-    belts = range(row.motion.chain.codes.shape[-1])
-    kinds: list[Any] = [GrazingSliding, CrossingSliding, SwitchingSliding, AddingSliding]
-    return [p for k in kinds for belt in belts for p in _points(line, k(belt), row)]
+    belts = row.motion.chain.codes.shape[-1]
+    return [point for one in borders_of(belts) for point in _points(line, one, row)]
 
 
 def _border(

@@ -26,7 +26,7 @@ from ..checks import (
     require,
     require_value,
 )
-from ..cycles.attractors import PLACE_DIMENSIONS, distance
+from ..cycles.attractors import PLACE_DIMENSIONS
 from ..model.oscillator import Oscillator
 from ..model.own_units import own_length, quantity, rescaled
 from ..model.parameters import leaf_index
@@ -35,7 +35,16 @@ from ..numerics.continuation import CurvePoint, Stop, continue_curve
 from ..results import Status, draw
 from ..tables import table_of
 from .base import AbstractCondition, BifurcationPoint
-from .special import CREEPS, SpecialPoint, Trail, where_belts_stop, where_edge_is_touched
+from .forced_ends import meeting_point
+from .special import (
+    CREEPS,
+    FAR,
+    SpecialPoint,
+    Trail,
+    is_elsewhere,
+    where_belts_stop,
+    where_edge_is_touched,
+)
 from .systems import Seen
 from .tracks import Track, special_between
 
@@ -44,9 +53,6 @@ if TYPE_CHECKING:
 
 #: Number of points after which the integration steps are distributed anew.
 REMESH = 10
-#: Largest change of a cycle or fixed point in a step, relative to its size. Along curves of classes
-#: (b), (c) and (d) it was 0.15 at most.
-FAR = 0.2
 
 
 class BifurcationCurve(eqx.Module):
@@ -294,11 +300,6 @@ def follow_point(
     )
 
 
-def is_elsewhere(place: np.ndarray, other: np.ndarray, far: float) -> bool:
-    """Whether two places a step or less apart are of two cycles, or fixed points, where known."""
-    return bool(distance(place[:4], other[:4], least=far) > far)
-
-
 # --- going along ----------------------------------------------------------------------------------
 
 
@@ -332,30 +333,35 @@ def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: f
     special: list[SpecialPoint] = []
     while True:
         note_progress(f"{len(rows)} points on one side")
-        points, found, beyond, end = _leg(problem, track, u, direction, origin)
+        leg = _leg(problem, track, u, direction, origin)
+        points, beyond, end = leg.points, leg.beyond, leg.end
         rows += [_row_at(problem, track, at.u, seen) for at, seen in points[min(len(rows), 1) :]]
-        special += found
+        special += [*leg.special, *leg.at_change]
         last = points[-1][0].u if points else u
-        if end is not Stop.LEFT_SPAN and (limit := _limit(problem, track, rows, last, end)):
+        if not rows:
+            return _OneSide(rows, special, end)
+        trail = _trail(problem, track, rows, last, end)
+        if end is not Stop.LEFT_SPAN and (limit := problem.condition.limit(trail)):
             rows += _towards(problem, rows[-1].values, limit)
             return _OneSide(rows, [*special, limit], Stop.STOPPED)
         if end is not Stop.LEFT_SPAN and (creeping := _end_at_rest(problem, rows, CREEPS)):
             return _OneSide(rows, [*special, creeping], Stop.STOPPED)
         if len(rows) >= problem.max_points or not points:
             why = Stop.POINT_COUNT if points else Stop.STEP_TOO_SMALL
-            return _ended(problem, rows, special, why)
+            return _ended(problem, rows, special, trail._replace(end=why))
         if beyond is None and end is not Stop.POINT_COUNT:
-            return _ended(problem, rows, special, end)
+            return _ended(problem, rows, special, trail)
         if beyond is None:
             # The same curve with a new mesh.
             track, u, direction = track.remeshed(last, points[-1][0].tangent)
             continue
         # The signature has changed between the last two points.
-        centre = np.array(found[-1].values) if found else 0.5 * (last + beyond.u)[-2:]
-        is_end = bool(found) and problem.condition.ends_at_contact
+        known = [one.values for one in leg.at_change]
+        centre = np.array(known[-1]) if known else 0.5 * (last + beyond.u)[-2:]
+        is_end = bool(known) and problem.condition.ends_at_contact
         further = None if is_end else _beyond(problem, track, last, centre)
         if further is None:
-            return _ended(problem, rows, special)
+            return _ended(problem, rows, special, trail)
         track, u = Track.begun(problem.variation, *further)
         direction = track.tangent(u)
         direction = direction * np.sign(direction[-2:] @ (u[-2:] - centre))
@@ -363,18 +369,20 @@ def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: f
 
 
 def _ended(
-    problem: _Problem, rows: list[_Row], special: list[SpecialPoint], end: Stop = Stop.STOPPED
+    problem: _Problem, rows: list[_Row], special: list[SpecialPoint], trail: Trail
 ) -> _OneSide:
-    if end in (Stop.LEFT_SPAN, Stop.CLOSED):
-        return _OneSide(rows, special, end)
+    if trail.end in (Stop.LEFT_SPAN, Stop.CLOSED):
+        return _OneSide(rows, special, trail.end)
     limit = _end_at_rest(problem, rows, 2 * problem.step)
-    if limit is None and end is Stop.STEP_TOO_SMALL:
+    if limit is None and trail.end is Stop.STEP_TOO_SMALL:
         last = [np.stack(column) for column in zip(*((row.values, row.place) for row in rows[-2:]))]
         limit = where_edge_is_touched(problem.variation, last[0], last[1], 1e-2 * problem.step)
+    if limit is None and trail.end is not Stop.POINT_COUNT:
+        limit = meeting_point(problem.condition, trail)
     known = [one.values for one in special if limit and one.kind == limit.kind]
     apart = [np.hypot(*np.subtract(limit.values, one)) for one in known] if limit else [0.0]
     named = [] if min(apart, default=np.inf) < problem.step else [limit]
-    return _OneSide(rows, [*special, *filter(None, named)], end)
+    return _OneSide(rows, [*special, *filter(None, named)], trail.end)
 
 
 def _end_at_rest(problem: _Problem, rows: list[_Row], near: float) -> SpecialPoint | None:
@@ -386,11 +394,13 @@ class _Leg(NamedTuple):
     """A leg of a curve.
 
     points: with what is seen there, where the motion exists; special: points of codimension two
-    between them; beyond: the next point, where it does not exist.
+    between them; beyond: the next point, where it does not exist; at_change: points of codimension
+    two between that and the last one.
     """
 
     points: list[tuple[CurvePoint, Seen]]
     special: list[SpecialPoint]
+    at_change: list[SpecialPoint]
     beyond: CurvePoint | None
     end: Stop
 
@@ -400,15 +410,15 @@ def _leg(problem: _Problem, track: Track, u, direction, origin) -> _Leg:
     for at in _points_along(problem, track, u, direction):
         if points:
             at = _closing(track, points[-1][0], at, origin) or at
-        points.append((at, track.seen_at(at.u)))
-        if len(points) > 1:
-            special += special_between(track, problem.limits, points[-2], points[-1])
-        if not points[-1][1].exists:
-            beyond, _ = points.pop()
-            return _Leg(points, special, beyond, Stop.STOPPED)
+        new = at, track.seen_at(at.u)
+        found = special_between(track, problem.limits, points[-1], new) if points else []
+        if not new[1].exists:
+            return _Leg(points, special, found, at, Stop.STOPPED)
+        points.append(new)
+        special += found
         if at.end is not None:
-            return _Leg(points, special, None, at.end)
-    return _Leg(points, special, None, Stop.STEP_TOO_SMALL)
+            return _Leg(points, special, [], None, at.end)
+    return _Leg(points, special, [], None, Stop.STEP_TOO_SMALL)
 
 
 def _closing(track: Track, before: CurvePoint, after: CurvePoint, origin) -> CurvePoint | None:
@@ -479,12 +489,10 @@ def _beyond(problem: _Problem, track: Track, last: np.ndarray, centre: np.ndarra
     return None if best is None else best[1:]
 
 
-def _limit(problem: _Problem, track: Track, rows: list[_Row], u, end: Stop):
-    """The point in which the curve ends where the motion ceases to exist, if it is near its
-    point u."""
+def _trail(problem: _Problem, track: Track, rows: list[_Row], u, end: Stop) -> Trail:
+    """The last stretch of a curve up to its point u."""
     values = np.array([row.values for row in rows[-3:]])
-    trail = Trail(problem.variation, problem.step, values, track.system, track.unknowns(u), end)
-    return problem.condition.limit(trail)
+    return Trail(problem.variation, problem.step, values, track.system, track.unknowns(u), end)
 
 
 def _towards(problem: _Problem, last: np.ndarray, limit: SpecialPoint) -> list[_Row]:

@@ -144,8 +144,6 @@ class Beginning(NamedTuple):
 class AbstractForcedCondition(AbstractCondition):
     """A condition on a periodic motion of a forced oscillator."""
 
-    ends_at_contact: ClassVar[bool] = True
-
     def check(self, osc):
         super().check(osc)
         check_clock(osc, type(self).__name__, "the conditions for oscillators without")
@@ -311,7 +309,9 @@ def motion_between_halves(
 # --- multipliers ----------------------------------------------------------------------------------
 
 
-class _UnitCircle(AbstractForcedCondition):
+class UnitCircle(AbstractForcedCondition):
+    """Multipliers of a motion are on the unit circle; parts: see `OnUnitCircle`."""
+
     parts: ClassVar[tuple[float, float, float]]
 
     def beginnings_of(self, osc, motion, known=False):
@@ -325,7 +325,7 @@ class _UnitCircle(AbstractForcedCondition):
         )
 
 
-class PeriodDoubling(_UnitCircle):
+class PeriodDoubling(UnitCircle):
     """A multiplier of a periodic motion is -1.
 
     The motion goes on, stable on one side only, and one of twice as many periods leaves it.
@@ -336,7 +336,7 @@ class PeriodDoubling(_UnitCircle):
     parts: ClassVar = (1.0, 1.0, 1.0)
 
 
-class Fold(_UnitCircle):
+class Fold(UnitCircle):
     """A multiplier of a periodic motion is 1: two motions meet and vanish."""
 
     caption: ClassVar[str] = "fold"
@@ -344,7 +344,7 @@ class Fold(_UnitCircle):
     parts: ClassVar = (1.0, -1.0, 1.0)
 
 
-class Torus(_UnitCircle):
+class Torus(UnitCircle):
     """A pair of multipliers has modulus 1: the motion loses its stability to a torus around it.
 
     The motion on the torus is quasi-periodic, or locked to the forcing. What sticks has no torus.

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from ..cycles.attractors import distance
 from ..model.oscillator import has_clock
 from ..model.variations import Variation
 from ..numerics.continuation import Stop
@@ -21,6 +22,9 @@ CREEPS = 1e-6
 #: A cycle that reaches less far than TOUCHES beyond an edge hardly touches it; less than TOUCHED is
 #: rounding.
 TOUCHES, TOUCHED = 1e-5, 1e-13
+#: Largest change of a cycle or fixed point in a step, relative to its size. Along curves of classes
+#: (b), (c) and (d) it was 0.15 at most.
+FAR = 0.2
 
 
 class SpecialPoint(NamedTuple):
@@ -36,7 +40,10 @@ class SpecialPoint(NamedTuple):
     of boundary equilibria and of pseudo-Hopf points meet its own), "BoundaryEquilibrium" (a side of
     a saddle ceases to push away, and its connection ends), "MeetingEdges" (the saddles of a
     connection come together), "BeltAtRest", "EqualVelocities", or a function that your own
-    condition watches.
+    condition watches. With forcing: a condition that holds, too ("PeriodDoubling", "Fold", "Torus",
+    "GrazingSliding", "CrossingSliding", "SwitchingSliding", "AddingSliding"), or a strong resonance
+    ("Resonance1to1" to "Resonance1to4": the multipliers of a torus are 1 and 1, -1 and -1, third or
+    fourth roots of 1; Y. A. Kuznetsov, Elements of Applied Bifurcation Theory, chapter 9).
 
     Attributes:
         kind: The kind.
@@ -73,6 +80,11 @@ class SpecialPoint(NamedTuple):
             The axes.
         """
         return draw(self, ax)
+
+
+def is_elsewhere(place: np.ndarray, other: np.ndarray, far: float) -> bool:
+    """Whether two places a step or less apart are of two motions, where known."""
+    return bool(distance(place[:4], other[:4], least=far) > far)
 
 
 def where_belts_stop(

@@ -30,7 +30,7 @@ from ..model.instants import guards_trend
 from ..model.modes import capacity, mode_acceleration, mode_of
 from ..model.oscillator import Oscillator, at_time
 from ..results import Status
-from .systems import PARTS_OF_ARC, AbstractChainSystem, Seen
+from .systems import PARTS_OF_ARC, AbstractChainSystem, Seen, Tests
 
 #: A multiplier that is off by less is the one that the condition asks for.
 ON_CIRCLE = 1e-6
@@ -70,12 +70,26 @@ class TimedSystem(AbstractChainSystem):
         error = jnp.max(jnp.abs(self.residual(osc, x)))
         motion = motion_at(osc, self.chain, x, error, jnp.asarray(0), jnp.asarray(0))
         exists = (motion.status == Status.OK) & (self.judge(osc, motion) == Status.OK)
-        return Seen({}, exists, jnp.real(motion.multipliers[0]), error)
+        return Seen(self.tests(motion), exists, jnp.real(motion.multipliers[0]), error)
 
-    def place(self, osc, x):
+    def tests(self, motion: PeriodicMotion) -> Tests:
+        """Functions to watch along a curve, see `Seen`: where multipliers meet the unit circle."""
+        trace, det = _trace_and_determinant(motion)
+        is_pair = jnp.imag(motion.multipliers[0]) != 0
+        return {
+            ("PeriodDoubling", ()): 1 + trace + det,
+            ("Fold", ()): 1 - trace + det,
+            ("Torus", ()): jnp.where(is_pair, det - 1, jnp.nan),
+        }
+
+    def motion(self, osc: Oscillator, x: Any) -> PeriodicMotion:
+        """The motion with the unknowns x of a solution, without its multipliers."""
         none = jnp.full(2, jnp.nan, complex)
         numbers = jnp.zeros(()), jnp.asarray(0), jnp.asarray(Status.OK.value)
-        return place_of_motion(PeriodicMotion(osc, self.chain, jnp.asarray(x), none, *numbers))
+        return PeriodicMotion(osc, self.chain, jnp.asarray(x), none, *numbers)
+
+    def place(self, osc, x):
+        return place_of_motion(self.motion(osc, x))
 
     def remeshed(self, osc, x):
         # The mesh has been refined, and will be once more.
@@ -113,6 +127,23 @@ class OnUnitCircle(TimedSystem):
         value, by_matrix = jax.value_and_grad(self._of)(matrix)
         contracted = functools.partial(jnp.tensordot, by_matrix, axes=2)
         return value, (contracted(by_z), contracted(by_p))
+
+    def tests(self, motion):
+        trace, det = _trace_and_determinant(motion)
+        on_fold, on_torus, on_doubling = (self.parts[1] == sign for sign in (-1, 0, 1))
+
+        def on(wanted, value):
+            return jnp.where(wanted, value, jnp.nan)
+
+        return {
+            ("PeriodDoubling", ()): on(on_fold, 1 + trace + det),
+            ("Fold", ()): on(on_doubling, 1 - trace + det),
+            # Of a torus the multipliers are a pair up to there; on other curves both are the same.
+            ("Resonance1to1", ()): jnp.where(on_torus, trace - 2, on(on_fold, det - 1)),
+            ("Resonance1to2", ()): jnp.where(on_torus, trace + 2, on(on_doubling, det - 1)),
+            ("Resonance1to3", ()): on(on_torus, trace + 1),
+            ("Resonance1to4", ()): on(on_torus, trace),
+        }
 
     def judge(self, osc, motion):
         # -1 or 1 where the trace counts; else a pair.
@@ -163,6 +194,11 @@ class AtLimit(TimedSystem):
         arrives = (self.rises == 0) | (guard_slope(osc, codes, end, y) < -ARRIVES)
         fits = (self.rises * rises >= 0) & arrives
         return first_failure(motion.status, fits, Status.OTHER_KIND)
+
+
+def _trace_and_determinant(motion: PeriodicMotion) -> tuple[Array, Array]:
+    """Of the monodromy matrix."""
+    return jnp.real(jnp.sum(motion.multipliers)), jnp.real(jnp.prod(motion.multipliers))
 
 
 def place_of_motion(motion: PeriodicMotion) -> np.ndarray:

@@ -1,0 +1,110 @@
+"""Ends of curves of forced oscillators in points where two conditions hold: `meeting_point`.
+
+The curve of a multiplier ends where the signature of its motion does, and a curve of a motion that
+a period doubling has left ends where its two halves come together. There the motion ceases to
+exist, or its equations are singular. The equations of the other curve through that point are
+regular, and the condition in question is one of the functions that are watched along it.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from ..cycles.clocked import turns_of
+from ..cycles.periodic import PeriodicMotion
+from ..numerics.continuation import continue_curve
+from ..results import Status
+from .base import AbstractCondition, BifurcationPoint
+from .crossings import CrossingSliding
+from .forced import (
+    AbstractForcedCondition,
+    AddingSliding,
+    PeriodDoubling,
+    SwitchingSliding,
+    UnitCircle,
+    motion_between_halves,
+)
+from .special import FAR, SpecialPoint, Trail, is_elsewhere
+from .tangencies import GrazingSliding
+from .timed_systems import place_of_motion
+from .tracks import Track, special_between
+
+#: How far from the last row such a point may be, in steps of the curve.
+REACH = 3
+#: Points of the other curve that are looked at to each side.
+POINTS_TO_A_SIDE = 5
+
+
+def borders_of(belts: int) -> list[AbstractCondition]:
+    """The conditions on which signatures of motions end, for so many belts."""
+    kinds = GrazingSliding, CrossingSliding, SwitchingSliding, AddingSliding
+    return [kind(belt) for kind in kinds for belt in range(belts)]
+
+
+def meeting_point(condition: AbstractCondition, trail: Trail) -> SpecialPoint | None:
+    """The point in which a curve ends where it meets another one, if it is near the last row; None
+    without forcing."""
+    if not isinstance(condition, AbstractForcedCondition):
+        return None
+    osc = trail.variation.oscillator(trail.values[-1])
+    motion = trail.system.motion(osc, trail.x)
+    found = []
+    if isinstance(condition, UnitCircle):
+        for border in borders_of(len(osc.belts)):
+            kind = type(condition).__name__
+            for point in _zeros_along(trail, border.with_clock(), motion, kind):
+                named = point._replace(kind=type(border).__name__, belts=border.belts_concerned)
+                found.append(named)
+    between = motion_between_halves(osc, motion, turns_of(osc))
+    if between is not None:
+        found += _zeros_along(trail, condition, between, PeriodDoubling.__name__)
+    return min(found, key=lambda point: _away(trail, point.values), default=None)
+
+
+def _zeros_along(
+    trail: Trail, condition: AbstractForcedCondition, motion: PeriodicMotion, kind: str
+) -> Iterator[SpecialPoint]:
+    """Special points of a kind on the curves of a condition that are found from a motion, near the
+    last row, and where the motion is about the same."""
+    anywhere, place = np.array([[-np.inf, np.inf]] * 2), place_of_motion(motion)
+    for point, values in _points_near(trail, condition, motion):
+        track, u = Track.begun(trail.variation, point, values)
+        if is_elsewhere(track.place(u), place, FAR):
+            continue
+        direction = track.tangent(u)
+        for sign in (1.0, -1.0):
+            points = continue_curve(
+                track.corrected,
+                u,
+                sign * direction,
+                step=trail.step,
+                min_step=1e-2 * trail.step,
+                max_step=trail.step,
+                max_points=POINTS_TO_A_SIDE,
+            )
+            seen = ((at, track.seen_at(at.u)) for at in points)
+            for before, after in pairwise(seen):
+                for special in special_between(track, anywhere, before, after):
+                    if special.kind == kind and _away(trail, special.values) < REACH * trail.step:
+                        yield special
+
+
+def _points_near(
+    trail: Trail, condition: AbstractForcedCondition, motion: PeriodicMotion
+) -> Iterator[tuple[BifurcationPoint, np.ndarray]]:
+    """Points of a condition with one of the parameters of the last row, and both parameters."""
+    last = trail.values[-1]
+    for free in (0, 1):
+        along = trail.variation.held(1 - free, float(last[1 - free]))
+        for point in condition.points(along, last[free : free + 1], motion):
+            values = last.copy()
+            values[free] = float(point.value)
+            if int(point.status) == Status.OK and _away(trail, values) < REACH * trail.step:
+                yield replace(point, condition=condition), values
+                return
+
+
+def _away(trail: Trail, values) -> float:
+    return float(np.linalg.norm(np.asarray(values) - trail.values[-1]))
