@@ -32,8 +32,8 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     sweeps/         naming forced_basins basins fractions orbit_diagram circle_map
     bifurcations/   special labels beside systems timed_systems guesses base conditions forced
     bifurcations/   tangencies crossings rests edge_rests edges folds meetings connections
-    bifurcations/   infinity path scan refine tracks curves cells faces bounds regions branches
-    bifurcations/   pieces diagrams switch_folds
+    bifurcations/   infinity path scan refine tracks forced_ends curves cells faces bounds
+    bifurcations/   regions branches pieces diagrams switch_folds
     inverse/        selection record search windows fit margins design
     si              results in SI units
     plotting/       style phase histories forced points diagrams regions categories sweeps orbits
