@@ -26,7 +26,7 @@ from ..checks import (
     require,
     require_value,
 )
-from ..cycles.attractors import PLACE_DIMENSIONS
+from ..cycles.attractors import PLACE_DIMENSIONS, SAME_CYCLE
 from ..model.oscillator import Oscillator
 from ..model.own_units import own_length, quantity, rescaled
 from ..model.parameters import leaf_index
@@ -319,6 +319,14 @@ class _Row(NamedTuple):
     place: np.ndarray
 
 
+class _Home(NamedTuple):
+    """Where a curve begins: both parameters, the direction in them, and the place of the motion."""
+
+    values: np.ndarray
+    direction: np.ndarray
+    place: np.ndarray
+
+
 class _OneSide(NamedTuple):
     rows: list[_Row]
     special: list[SpecialPoint]
@@ -328,12 +336,13 @@ class _OneSide(NamedTuple):
 def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: float) -> _OneSide:
     """The curve to one side of a point: leg by leg, each with one signature and one mesh."""
     track, u = Track.begun(problem.variation, point, start)
-    origin, direction = u[-2:], sign * track.tangent(u)
+    direction = sign * track.tangent(u)
+    home = _Home(u[-2:], direction[-2:], track.place(u))
     rows: list[_Row] = []
     special: list[SpecialPoint] = []
     while True:
         note_progress(f"{len(rows)} points on one side")
-        leg = _leg(problem, track, u, direction, origin)
+        leg = _leg(problem, track, u, direction, home)
         points, beyond, end = leg.points, leg.beyond, leg.end
         rows += [_row_at(problem, track, at.u, seen) for at, seen in points[min(len(rows), 1) :]]
         special += [*leg.special, *leg.at_change]
@@ -405,11 +414,11 @@ class _Leg(NamedTuple):
     end: Stop
 
 
-def _leg(problem: _Problem, track: Track, u, direction, origin) -> _Leg:
+def _leg(problem: _Problem, track: Track, u, direction, home: _Home) -> _Leg:
     points, special = [], []
     for at in _points_along(problem, track, u, direction):
         if points:
-            at = _closing(track, points[-1][0], at, origin) or at
+            at = _closing(track, points[-1][0], at, home) or at
         new = at, track.seen_at(at.u)
         found = special_between(track, problem.limits, points[-1], new) if points else []
         if not new[1].exists:
@@ -421,16 +430,19 @@ def _leg(problem: _Problem, track: Track, u, direction, origin) -> _Leg:
     return _Leg(points, special, [], None, Stop.STEP_TOO_SMALL)
 
 
-def _closing(track: Track, before: CurvePoint, after: CurvePoint, origin) -> CurvePoint | None:
+def _closing(track: Track, before: CurvePoint, after: CurvePoint, home: _Home) -> CurvePoint | None:
     """The point where the curve began, if the step from one point to the next passes it."""
     chord = (after.u - before.u)[-2:]
-    part = (origin - before.u[-2:]) @ chord / (chord @ chord)
+    part = (home.values - before.u[-2:]) @ chord / (chord @ chord)
     if not 1e-9 < part <= 1:
         return None
     guess = before.u + part * (after.u - before.u)
     normal = np.append(np.zeros(guess.size - 2), chord)
     at = track.corrected(guess, normal / np.linalg.norm(chord), 0.0)
-    if not at.found or np.linalg.norm(at.u[-2:] - origin) > 1e-6 * np.linalg.norm(chord):
+    away = np.linalg.norm(at.u[-2:] - home.values) > 1e-6 * np.linalg.norm(chord)
+    if not at.found or away or at.tangent[-2:] @ home.direction < 0:
+        return None
+    if is_elsewhere(track.place(at.u), home.place, SAME_CYCLE):
         return None
     return after._replace(u=at.u, tangent=at.tangent, end=Stop.CLOSED)
 
@@ -475,6 +487,9 @@ def _beyond(problem: _Problem, track: Track, last: np.ndarray, centre: np.ndarra
                 point = condition.named_point_beside(held, guess, *known)
                 if point is None or is_elsewhere(point.place, place, FAR):
                     continue
+                system, _ = point.condition.applied_to(point.oscillator).system_at(point)
+                if track.system.is_of_same_arcs(system):
+                    continue  # from before the change
                 if point.condition.lineage != condition.lineage:
                     continue
                 at = values.copy()

@@ -60,7 +60,7 @@ def meeting_point(condition: AbstractCondition, trail: Trail) -> SpecialPoint | 
     between = motion_between_halves(osc, motion, turns_of(osc))
     if between is not None:
         found += _zeros_along(trail, condition, between, PeriodDoubling.__name__)
-    return min(found, key=lambda point: _away(trail, point.values), default=None)
+    return min(found, key=lambda point: _from_last_row(trail, point.values), default=None)
 
 
 def _zeros_along(
@@ -87,7 +87,10 @@ def _zeros_along(
             seen = ((at, track.seen_at(at.u)) for at in points)
             for before, after in pairwise(seen):
                 for special in special_between(track, anywhere, before, after):
-                    if special.kind == kind and _away(trail, special.values) < REACH * trail.step:
+                    if (
+                        special.kind == kind
+                        and _from_last_row(trail, special.values) < REACH * trail.step
+                    ):
                         yield special
 
 
@@ -101,10 +104,17 @@ def _points_near(
         for point in condition.points(along, last[free : free + 1], motion):
             values = last.copy()
             values[free] = float(point.value)
-            if int(point.status) == Status.OK and _away(trail, values) < REACH * trail.step:
+            if (
+                int(point.status) == Status.OK
+                and _from_last_row(trail, values) < REACH * trail.step
+            ):
                 yield replace(point, condition=condition), values
                 return
 
 
-def _away(trail: Trail, values) -> float:
+def _is_near(trail: Trail, values) -> bool:
+    return _from_last_row(trail, values) < REACH * trail.step
+
+
+def _from_last_row(trail: Trail, values) -> float:
     return float(np.linalg.norm(np.asarray(values) - trail.values[-1]))

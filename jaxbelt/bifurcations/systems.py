@@ -68,6 +68,10 @@ class Seen(NamedTuple):
 class AbstractSystem(eqx.Module):
     """Equations in the unknowns of a motion, one more than there are unknowns."""
 
+    def is_of_same_arcs(self, other: "AbstractSystem") -> bool:
+        """Whether another system has the same signature; what has none has another one."""
+        return False
+
     @abc.abstractmethod
     def residual(self, osc: Oscillator, x: Array) -> Array:
         """The equations at the unknowns x, in one array."""
@@ -168,6 +172,13 @@ class AbstractChainSystem(AbstractSystem):
     def error_of_steps(self, osc: Oscillator, x: Array) -> Array:
         """The error of the integration steps in the equations of each arc at x, [N]."""
 
+    def is_of_same_arcs(self, other: AbstractSystem) -> bool:
+        """Whether another system has the same arcs, and the same numbers of arcs, belts, edges."""
+        if type(other) is not type(self):
+            return False
+        own, others = _numbers_in(self), _numbers_in(other)
+        return all(map(np.array_equal, own, others))
+
     def shaped(self, x):
         return x.reshape(self.chain.ends.size, -1)
 
@@ -186,6 +197,12 @@ class AbstractChainSystem(AbstractSystem):
         is_exact = self.error_of_steps(osc, x) < EXACT_ARC * (1 + jnp.max(jnp.abs(x[:, :2])))
         mesh = jnp.where(is_exact[:, None], coarse, fine)
         return eqx.tree_at(lambda system: system.chain.mesh, self, lax.stop_gradient(mesh))
+
+
+def _numbers_in(system: AbstractChainSystem) -> list[np.ndarray]:
+    """The codes of the arcs, and all whole numbers of a system."""
+    numbers = [np.asarray(leaf) for leaf in jax.tree.leaves(eqx.filter(system, eqx.is_array))]
+    return [np.asarray(system.chain.codes), *(one for one in numbers if one.dtype.kind in "biu")]
 
 
 def third_derivative(osc: Oscillator, codes: Array, x1: Array) -> Array:
