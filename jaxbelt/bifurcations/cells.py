@@ -121,7 +121,8 @@ class Cells(NamedTuple):
     names: of the regions, "" where runs were undecided, or nothing attracts. motions: a number for
     everything: kind, stability and contacts of each equilibrium, the events of each cycle and the
     belts that it sticks to; equal where all that is equal, -1 where runs were undecided. on_line:
-    whether a belt is at rest there, or two belts have one velocity.
+    whether a belt is at rest or without load there, or two belts have one velocity, and this is not
+    so in all cells.
     """
 
     names: np.ndarray
@@ -158,33 +159,38 @@ def motions_in_cells(
         number = known.setdefault(tuple(row[2:]), len(known))
         numbers.append(number if row[0] else -1)
     which = which.reshape(count)
-    return Cells(np.array(named)[which], np.array(numbers)[which], _on_line(still.velocities))
+    return Cells(np.array(named)[which], np.array(numbers)[which], _on_line(still))
 
 
 def _arguments(names: Sequence[str], point: Any) -> dict[str, float]:
     return dict(zip(names, map(float, point), strict=True))
 
 
-def _on_line(velocities: np.ndarray) -> np.ndarray:
-    """Where a belt is at rest, or two have one velocity; velocities: [cells, belts]."""
+def _on_line(still: "_Still") -> np.ndarray:
+    """Where a belt is at rest or without load, or two have one velocity, unless in all cells."""
     # A belt at rest has the velocity of the frame, which counts as one more belt.
+    velocities = np.asarray(still.velocities)
     count, n = velocities.shape
     others = np.append(velocities, np.zeros((count, 1)), axis=-1)
     meet = np.abs(velocities[:, :, None] - others[:, None, :]) < SAME_VELOCITY
-    return np.any(meet & ~np.eye(n, n + 1, dtype=bool), axis=(-2, -1))
+    meet = meet & ~np.eye(n, n + 1, dtype=bool)
+    holds = np.concatenate([meet.reshape(count, -1), still.idle], axis=1)
+    return np.any(holds & ~np.all(holds, axis=0), axis=1)
 
 
 class _Still(NamedTuple):
     """What is known of the cells before any run.
 
-    kind, stable: of the equilibria, [cells, equilibria]; modes: [.., belts]; velocities: [cells,
-    belts]; starts: of `scan`, [cells, starts, 2]; leaves: of the oscillators, [cells] each.
+    kind, stable: of the equilibria, [cells, equilibria]; modes: [.., belts]; velocities, and which
+    belts are idle, without load: [cells, belts]; starts: of `scan`, [cells, starts, 2]; leaves: of
+    the oscillators, [cells] each.
     """
 
     kind: Array
     stable: Array
     modes: Array
     velocities: Array
+    idle: Array
     starts: Array
     leaves: list[Array]
 
@@ -200,7 +206,7 @@ def _still_at(make, names, points: Array) -> _Still:
         idle = jnp.stack([belt.load for belt in osc.belts]) == 0
         modes = jnp.where(idle, 0, rests.modes)
         leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves(osc)]
-        return _Still(rests.kind, rests.stable, modes, velocities, starts, leaves)
+        return _Still(rests.kind, rests.stable, modes, velocities, idle, starts, leaves)
 
     return jax.vmap(one)(points)
 

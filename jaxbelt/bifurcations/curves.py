@@ -51,6 +51,9 @@ from .tracks import Track, special_between
 if TYPE_CHECKING:
     import pandas
 
+#: Steps are shortened to this fraction before a curve ends because none is short enough: a curve of
+#: nonsmooth folds has a turning point with a radius of a hundredth of a step.
+SHORTEST_PART = 1e-3
 #: Number of points after which the integration steps are distributed anew.
 REMESH = 10
 
@@ -310,6 +313,12 @@ class _Problem(NamedTuple):
     step: float
     max_points: int
 
+    def contains(self, point: SpecialPoint) -> bool:
+        """Whether a point is in the span, up to rounding."""
+        slack = 1e-12 * np.ptp(self.limits, axis=1)
+        low, high = self.limits.T
+        return bool(np.all((low - slack <= point.values) & (point.values <= high + slack)))
+
 
 class _Row(NamedTuple):
     values: np.ndarray
@@ -350,10 +359,12 @@ def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: f
         if not rows:
             return _OneSide(rows, special, end)
         trail = _trail(problem, track, rows, last, end)
-        if end is not Stop.LEFT_SPAN and (limit := problem.condition.limit(trail)):
+        limit = None if end is Stop.LEFT_SPAN else problem.condition.limit(trail)
+        if limit is not None and problem.contains(limit):
             rows += _towards(problem, rows[-1].values, limit)
             return _OneSide(rows, [*special, limit], Stop.STOPPED)
-        if end is not Stop.LEFT_SPAN and (creeping := _end_at_rest(problem, rows, CREEPS)):
+        creeping = None if end is Stop.LEFT_SPAN else _end_at_rest(problem, rows, CREEPS)
+        if creeping is not None and problem.contains(creeping):
             return _OneSide(rows, [*special, creeping], Stop.STOPPED)
         if len(rows) >= problem.max_points or not points:
             why = Stop.POINT_COUNT if points else Stop.STEP_TOO_SMALL
@@ -388,6 +399,8 @@ def _ended(
         limit = where_edge_is_touched(problem.variation, last[0], last[1], 1e-2 * problem.step)
     if limit is None and trail.end is not Stop.POINT_COUNT:
         limit = meeting_point(problem.condition, trail)
+    if limit is not None and not problem.contains(limit):
+        limit = None
     known = [one.values for one in special if limit and one.kind == limit.kind]
     apart = [np.hypot(*np.subtract(limit.values, one)) for one in known] if limit else [0.0]
     named = [] if min(apart, default=np.inf) < problem.step else [limit]
@@ -456,7 +469,7 @@ def _points_along(problem: _Problem, track: Track, u: np.ndarray, direction: np.
         direction,
         span=(span[0], span[1]),
         step=problem.step,
-        min_step=1e-2 * problem.step,
+        min_step=SHORTEST_PART * problem.step,
         max_step=problem.step,
         max_points=REMESH,
     )

@@ -73,10 +73,10 @@ class Faces:
         return [(float(p), float(q)) for p, q in (self.low + np.array(at) * step for at in places)]
 
     def named(self, points: np.ndarray, names: Sequence[str]) -> np.ndarray:
-        """Name of each pixel, from points with names, [PIXELS, PIXELS]."""
+        """Name of each pixel, from points with names, [PIXELS, PIXELS]; "" without any points."""
         from scipy.ndimage import find_objects
 
-        known = sorted(set(names))
+        known = sorted(set(names)) or [""]
         seeds = np.full(self.number.shape, -1)
         for point, name in zip(points, names, strict=True):
             at = self._pixel(point)

@@ -62,8 +62,8 @@ class RegionMap(eqx.Module):
         curves: Bounds of the regions, see `BifurcationCurve`.
         cycles: By the name of a region, the cycles in its example, attracting ones and the unstable
             one.
-        on_line: Cells where a belt is at rest, or two belts have one velocity, [n, m]; their names
-            hold on that line only.
+        on_line: Cells where a belt is at rest or without load, or two belts have one velocity,
+            [n, m], unless this is so in all of them; their names hold on that line only.
         between: (p, q, name) in each part of the plane between curves that contains no cell.
         make: The given function.
         uncovered: Pairs of neighbouring cells, ((p, q), (p, q)), that differ, though no curve
@@ -286,11 +286,8 @@ def varied_by_names(make, names: tuple[str, str], values: Sequence[np.ndarray]) 
 
 
 def _motions_in_all(make, names, values, starts):
-    """Names of all cells, numbers of the motions in them, and whether they lie on a line, [n, m]
-    each.
-
-    On these lines velocities meet.
-    """
+    """Names of all cells, numbers of the motions in them, and whether they lie on a line, see
+    `Cells`, [n, m] each."""
     grid = np.meshgrid(*values, indexing="ij")
     cells = motions_in_cells(make, names, np.column_stack([axis.ravel() for axis in grid]), starts)
     shape = grid[0].shape
@@ -313,7 +310,9 @@ def _at(make, names, pair) -> Oscillator:
 
 def _faces_of(values, label, on_line, curves) -> tuple[Faces, np.ndarray, list[str]]:
     """The faces of a map, and the cells that determine the name of an area, with their names."""
-    (p, q), known = values, (label != "") & ~on_line
+    (p, q), known = values, label != ""
+    if np.any(known & ~on_line):
+        known = known & ~on_line
     faces = Faces(((p[0], p[-1]), (q[0], q[-1])), [curve.path for curve in curves])
     rows, columns = np.nonzero(known)
     return faces, np.column_stack([p[rows], q[columns]]), label[known].tolist()

@@ -46,8 +46,8 @@ def region_map(
     - **OUT.png**: the map, and a sketch of the phase portrait of each region.
 
     - **OUT.csv**: a row for each cell: both parameters, the name of the region, its meaning in the
-      words of the picture's key, and on_line: 1 where a belt is at rest, or two belts have one
-      velocity; the picture leaves such cells out.
+      words of the picture's key, and on_line: 1 where a belt is at rest or without load, or two
+      belts have one velocity, unless this is so in all cells; the picture leaves such cells out.
 
     - **OUT_curves.csv**: a row for each point of a curve: curve, condition, belts, both parameters,
       multiplier of the cycle without the stick phase that vanishes, residual, special. Points of

@@ -136,7 +136,7 @@ def _region_colour(name: str) -> tuple[float, float, float]:
 
 def draw_region_map(regions: RegionMap, figure: Figure) -> Axes:
     """Draws the map, and below it a sketch of the phase portrait of each region, in its example."""
-    names = [name for name in regions.regions if _has_area(regions, name)]
+    names = [name for name in regions.regions if _has_area(regions, name)] or [*regions.regions]
     named = regions.as_paper or _names_equilibria(regions)
     columns = 5 if named else 4
     rows = -(-len(names) // columns)
@@ -154,7 +154,7 @@ def draw_region_map(regions: RegionMap, figure: Figure) -> Axes:
     beside.axis("off")
     key = {"loc": "center left", "borderaxespad": 0.0, "handlelength": 2.4, "frameon": False}
     beside.legend(entries.values(), entries.keys(), **key)
-    lower = whole[1].subgridspec(rows, columns)
+    lower = whole[1].subgridspec(max(rows, 1), columns)
     titles = {name: name for name in names}
     if not named:
         titles = {name: words.replace("; ", ";\n") for name, words in regions.words.items()}

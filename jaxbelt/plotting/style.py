@@ -127,6 +127,8 @@ def draw_key(figure: Figure, note: str = "", *, leave_out: Axes | None = None) -
     The key has as many columns as fit. leave_out: axes that have their own key.
     """
     entries = key_entries([axes for axes in figure.axes if axes is not leave_out])
+    if not entries and not note:
+        return
     figure.legend(
         entries.values(),
         entries.keys(),
