@@ -32,7 +32,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     sweeps/         naming forced_basins basins fractions orbit_diagram circle_map
     bifurcations/   special labels beside systems timed_systems guesses base conditions forced
     bifurcations/   tangencies crossings rests edge_rests edges folds meetings connections
-    bifurcations/   infinity path scan refine tracks forced_ends curves cells faces bounds
+    bifurcations/   infinity path scan refine tracks forced_ends changes curves cells faces bounds
     bifurcations/   regions branches pieces diagrams switch_folds
     inverse/        selection record search windows fit margins design
     si              results in SI units

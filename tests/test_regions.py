@@ -3,16 +3,18 @@
 import functools
 import itertools
 
+import matplotlib.pyplot as plt
 import numpy as np
 import oracle
 import oracle_cycles
 import pytest
+from scipy.spatial import cKDTree
 
 import jaxbelt as jb
 from jaxbelt.bifurcations.bounds import Bounds, _without_known, neighbours_that_differ
 from jaxbelt.bifurcations.cells import motions_in_cells, region_name
 from jaxbelt.bifurcations.labels import Label
-from jaxbelt.bifurcations.regions import varied_by_names
+from jaxbelt.bifurcations.regions import RegionMap, varied_by_names
 from jaxbelt.numerics.continuation import Stop
 from tests.campaign import engine
 from tests.campaign.cases import PAPER
@@ -203,3 +205,73 @@ def test_a_map_is_the_same_in_other_units():
     assert len(ours) == 2 and [a[0] for a in ours] == [b[0] for b in theirs]
     for a, b in zip(ours, theirs, strict=True):
         assert a[1:] == pytest.approx(b[1:], abs=2e-2)
+
+
+@pytest.mark.slow
+def test_a_belt_may_be_two_in_the_whole_plane():
+    law = jb.presets.paper_friction()
+
+    def split(nu0, nu1):
+        half = jb.Belt(nu1, law, load=0.5)
+        return jb.Oscillator(0.5, (jb.Belt(nu0, law), half, half))
+
+    axes = {"nu0": np.linspace(-0.2, 0.62, 12), "nu1": np.linspace(0.02, 0.61, 11)}
+    one = jb.region_map(jb.presets.class_b, axes, lines=1, step=0.03)
+    two = jb.region_map(split, axes, lines=1, step=0.03)
+    # Belt 1 is belts 1 and 2: b is f, c is g.
+    table = str.maketrans("bc", "fg")
+    assert np.array_equal(np.char.translate(one.label, table), two.label)
+    assert two.uncovered == () and np.array_equal(one.on_line, two.on_line)
+    kinds = {kind for curve in one.curves for kind in curve.kinds}
+    assert "NonsmoothFold" in kinds
+    assert kinds == {kind for curve in two.curves for kind in curve.kinds}
+
+    def densely_along(path):
+        at = np.arange(len(path))
+        return np.column_stack([np.interp(np.arange(0, at[-1], 0.02), at, x) for x in path.T])
+
+    def densely(made):
+        return np.concatenate([densely_along(curve.path) for curve in made.curves])
+
+    for a, b in ((one, two), (two, one)):
+        assert cKDTree(densely(a)).query(densely(b))[0].max() < 2e-3
+
+
+@pytest.mark.slow
+def test_a_plane_in_which_a_belt_rests_throughout_has_a_picture():
+    law = jb.presets.paper_friction()
+
+    def braked(velocity, damping):
+        pad = jb.Belt(0.0, law, load=0.2)
+        return jb.Oscillator(damping, (jb.Belt(velocity, law), pad))
+
+    axes = {"velocity": np.linspace(0.1, 0.5, 4), "damping": np.linspace(0.1, 0.8, 3)}
+    made = jb.region_map(braked, axes, lines=1, step=0.03)
+    assert not made.on_line.any() and set(np.unique(made.raster())) == {"1"}
+    assert made.plot().figure is not None
+    plt.close("all")
+
+
+def test_a_map_whose_cells_are_all_on_lines_or_undecided_has_a_picture():
+    values = np.array([0.0, 1.0])
+    for name, on_line in (("1", True), ("", False)):
+        label, lines = np.full((2, 2), name), np.full((2, 2), on_line)
+        made = RegionMap(
+            *(("nu0", "nu1"), (values, values), label, (), {name: ()}, lines, ()),
+            jb.presets.class_b,
+        )
+        assert set(np.unique(made.raster())) == {name}
+        assert made.plot().figure is not None
+    plt.close("all")
+
+
+@pytest.mark.slow
+def test_cells_with_a_belt_without_load_do_not_differ_from_their_neighbours():
+    law = jb.presets.paper_friction()
+
+    def make(load, damping):
+        return jb.Oscillator(damping, (jb.Belt(0.3, law), jb.Belt(0.15, law, load=load)))
+
+    axes = {"load": np.linspace(0.0, 0.6, 4), "damping": np.linspace(0.3, 1.0, 4)}
+    made = jb.region_map(make, axes, lines=2, step=0.03)
+    assert np.array_equal(made.on_line, np.arange(4)[:, None] == [[0] * 4]) and made.uncovered == ()

@@ -21,6 +21,7 @@ from ..numerics.continuation import Stop
 from ..numerics.widths import as_here
 from ..results import Status
 from .base import BifurcationPoint
+from .changes import from_chords
 from .curves import BifurcationCurve, follow_point
 from .faces import densely
 from .path import ParameterPath
@@ -232,19 +233,10 @@ def _rows_on(
     """Which rows of a curve are on another one, with the motion at the same place, [rows]."""
     path, rows, found = other.path / unit, other.values / unit, np.zeros(len(curve), bool)
     for row, (at, place) in enumerate(zip(curve.values / unit, curve.places, strict=True)):
-        away, _ = _from_chords(at, path)
+        away, _ = from_chords(at, path)
         there = other.places[int(np.argmin(np.hypot(*(rows - at).T)))]
         found[row] = np.min(away) < near and not is_elsewhere(place, there, SAME_PLACE)
     return found
-
-
-def _from_chords(at: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance of a point from each chord of a path, and the part of the chord where it is,
-    [chords]."""
-    a, chord = path[:-1], np.diff(path, axis=0)
-    along = np.sum((at - a) * chord, axis=1) / np.maximum(np.sum(chord**2, axis=1), 1e-300)
-    along = np.clip(along, 0, 1)
-    return np.hypot(*(at - a - along[:, None] * chord).T), along
 
 
 def _shortened(curve: BifurcationCurve, first: int, last: int) -> BifurcationCurve:
@@ -318,7 +310,7 @@ def _lies_on(
     """Whether a point is on a known curve."""
     if point.condition.lineage != curve.condition.lineage:
         return False
-    away, along = _from_chords(at / unit, curve.values / unit)
+    away, along = from_chords(at / unit, curve.values / unit)
     places = curve.places[:-1] + along[:, None] * np.diff(curve.places, axis=0)
     own = point.place
     return any(

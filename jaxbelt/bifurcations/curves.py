@@ -35,10 +35,10 @@ from ..numerics.continuation import CurvePoint, Stop, continue_curve
 from ..results import Status, draw
 from ..tables import table_of
 from .base import AbstractCondition, BifurcationPoint
+from .changes import CurveProblem, CurveRow, beyond_change
 from .forced_ends import meeting_point
 from .special import (
     CREEPS,
-    FAR,
     SpecialPoint,
     Trail,
     is_elsewhere,
@@ -54,6 +54,8 @@ if TYPE_CHECKING:
 #: Steps are shortened to this fraction before a curve ends because none is short enough: a curve of
 #: nonsmooth folds has a turning point with a radius of a hundredth of a step.
 SHORTEST_PART = 1e-3
+#: Where no step is short enough, a point of codimension two this near is in the way, in steps.
+JUST_AHEAD = 0.02
 #: Number of points after which the integration steps are distributed anew.
 REMESH = 10
 
@@ -280,7 +282,7 @@ def follow_point(
     units = np.asarray(variation.family(start).units)
     measured, ends = variation.measured_in(units), limits / units[:, None]
     condition = point.condition.applied_to(point.oscillator)
-    problem = _Problem(condition, measured, ends, step, max_points)
+    problem = CurveProblem(condition, measured, ends, step, max_points)
     start = start / units
     ahead = _side(problem, point, start, 1.0)
     closed = ahead.end is Stop.CLOSED
@@ -306,28 +308,6 @@ def follow_point(
 # --- going along ----------------------------------------------------------------------------------
 
 
-class _Problem(NamedTuple):
-    condition: AbstractCondition
-    variation: Variation
-    limits: np.ndarray
-    step: float
-    max_points: int
-
-    def contains(self, point: SpecialPoint) -> bool:
-        """Whether a point is in the span, up to rounding."""
-        slack = 1e-12 * np.ptp(self.limits, axis=1)
-        low, high = self.limits.T
-        return bool(np.all((low - slack <= point.values) & (point.values <= high + slack)))
-
-
-class _Row(NamedTuple):
-    values: np.ndarray
-    kind: type[AbstractCondition]
-    multiplier: float
-    residual: float
-    place: np.ndarray
-
-
 class _Home(NamedTuple):
     """Where a curve begins: both parameters, the direction in them, and the place of the motion."""
 
@@ -337,17 +317,20 @@ class _Home(NamedTuple):
 
 
 class _OneSide(NamedTuple):
-    rows: list[_Row]
+    rows: list[CurveRow]
     special: list[SpecialPoint]
     end: Stop
 
 
-def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: float) -> _OneSide:
+def _side(
+    problem: CurveProblem, point: BifurcationPoint, start: np.ndarray, sign: float
+) -> _OneSide:
     """The curve to one side of a point: leg by leg, each with one signature and one mesh."""
     track, u = Track.begun(problem.variation, point, start)
     direction = sign * track.tangent(u)
     home = _Home(u[-2:], direction[-2:], track.place(u))
-    rows: list[_Row] = []
+    rows: list[CurveRow] = []
+    seen_last: list[tuple[CurvePoint, Seen]] = []
     special: list[SpecialPoint] = []
     while True:
         note_progress(f"{len(rows)} points on one side")
@@ -355,6 +338,7 @@ def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: f
         points, beyond, end = leg.points, leg.beyond, leg.end
         rows += [_row_at(problem, track, at.u, seen) for at, seen in points[min(len(rows), 1) :]]
         special += [*leg.special, *leg.at_change]
+        seen_last = [*seen_last, *points[min(len(seen_last), 1) :]][-2:]
         last = points[-1][0].u if points else u
         if not rows:
             return _OneSide(rows, special, end)
@@ -366,30 +350,58 @@ def _side(problem: _Problem, point: BifurcationPoint, start: np.ndarray, sign: f
         creeping = None if end is Stop.LEFT_SPAN else _end_at_rest(problem, rows, CREEPS)
         if creeping is not None and problem.contains(creeping):
             return _OneSide(rows, [*special, creeping], Stop.STOPPED)
-        if len(rows) >= problem.max_points or not points:
-            why = Stop.POINT_COUNT if points else Stop.STEP_TOO_SMALL
-            return _ended(problem, rows, special, trail._replace(end=why))
-        if beyond is None and end is not Stop.POINT_COUNT:
+        if len(rows) >= problem.max_points:
+            return _ended(problem, rows, special, trail._replace(end=Stop.POINT_COUNT))
+        changes = leg.at_change
+        if not points or end is Stop.STEP_TOO_SMALL:
+            trail = trail._replace(end=Stop.STEP_TOO_SMALL)
+            changes = _just_ahead(seen_last, problem.step)
+            special += changes
+            if not changes:
+                return _ended(problem, rows, special, trail)
+        elif beyond is None and end is not Stop.POINT_COUNT:
             return _ended(problem, rows, special, trail)
-        if beyond is None:
+        elif beyond is None:
             # The same curve with a new mesh.
             track, u, direction = track.remeshed(last, points[-1][0].tangent)
             continue
-        # The signature has changed between the last two points.
-        known = [one.values for one in leg.at_change]
-        centre = np.array(known[-1]) if known else 0.5 * (last + beyond.u)[-2:]
-        is_end = bool(known) and problem.condition.ends_at_contact
-        further = None if is_end else _beyond(problem, track, last, centre)
+        # The signature changes here, or between the last two points.
+        centre = last[-2:] if beyond is None else 0.5 * (last + beyond.u)[-2:]
+        centre = np.array(changes[-1].values) if changes else centre
+        is_end = bool(changes) and problem.condition.ends_at_contact
+        further = None if is_end else beyond_change(problem, track, rows, last, centre, changes)
         if further is None:
             return _ended(problem, rows, special, trail)
         track, u = Track.begun(problem.variation, *further)
         direction = track.tangent(u)
         direction = direction * np.sign(direction[-2:] @ (u[-2:] - centre))
         rows.append(_row_at(problem, track, u, track.seen_at(u)))
+        seen_last = []
+
+
+def _just_ahead(seen: list[tuple[CurvePoint, Seen]], step: float) -> list[SpecialPoint]:
+    """The point of codimension two just behind the last one of two points, by a line through what
+    is watched; the residual is its distance from there.
+
+    Where an arc begins or ends on an edge its duration goes like a square root, so no step leads
+    there.
+    """
+    if len(seen) < 2:
+        return []
+    (before, was), (last, now) = seen
+    found = []
+    for name, value in now.tests.items():
+        change = was.tests.get(name, np.nan) - value
+        part = value / change if change else np.inf
+        away = part * np.linalg.norm((last.u - before.u)[-2:])
+        if 0 < part and away < JUST_AHEAD * step:
+            at = last.u[-2:] + part * (last.u - before.u)[-2:]
+            found.append(SpecialPoint(*name, (float(at[0]), float(at[1])), float(away)))
+    return sorted(found, key=lambda point: point.residual)[:1]
 
 
 def _ended(
-    problem: _Problem, rows: list[_Row], special: list[SpecialPoint], trail: Trail
+    problem: CurveProblem, rows: list[CurveRow], special: list[SpecialPoint], trail: Trail
 ) -> _OneSide:
     if trail.end in (Stop.LEFT_SPAN, Stop.CLOSED):
         return _OneSide(rows, special, trail.end)
@@ -407,7 +419,7 @@ def _ended(
     return _OneSide(rows, [*special, *filter(None, named)], trail.end)
 
 
-def _end_at_rest(problem: _Problem, rows: list[_Row], near: float) -> SpecialPoint | None:
+def _end_at_rest(problem: CurveProblem, rows: list[CurveRow], near: float) -> SpecialPoint | None:
     values = np.array([row.values for row in rows[-3:]])
     return where_belts_stop(problem.variation, values, near, 3 * problem.step)
 
@@ -427,7 +439,7 @@ class _Leg(NamedTuple):
     end: Stop
 
 
-def _leg(problem: _Problem, track: Track, u, direction, home: _Home) -> _Leg:
+def _leg(problem: CurveProblem, track: Track, u, direction, home: _Home) -> _Leg:
     points, special = [], []
     for at in _points_along(problem, track, u, direction):
         if points:
@@ -460,7 +472,7 @@ def _closing(track: Track, before: CurvePoint, after: CurvePoint, home: _Home) -
     return after._replace(u=at.u, tangent=at.tangent, end=Stop.CLOSED)
 
 
-def _points_along(problem: _Problem, track: Track, u: np.ndarray, direction: np.ndarray):
+def _points_along(problem: CurveProblem, track: Track, u: np.ndarray, direction: np.ndarray):
     span = np.full((2, u.size), np.inf) * np.array([[-1.0], [1.0]])
     span[:, -2:] = problem.limits.T
     return continue_curve(
@@ -475,55 +487,19 @@ def _points_along(problem: _Problem, track: Track, u: np.ndarray, direction: np.
     )
 
 
-def _row_at(problem: _Problem, track: Track, u: np.ndarray, seen: Seen) -> _Row:
+def _row_at(problem: CurveProblem, track: Track, u: np.ndarray, seen: Seen) -> CurveRow:
     osc = problem.variation.oscillator(u[-2:])
     kind = problem.condition.kind_along(osc, seen.multiplier)
-    return _Row(u[-2:], kind, seen.multiplier, seen.residual, track.place(u))
+    return CurveRow(u[-2:], kind, seen.multiplier, seen.residual, track.place(u))
 
 
-def _beyond(problem: _Problem, track: Track, last: np.ndarray, centre: np.ndarray):
-    """The point of the same condition just beyond a change of signature, and where, or None.
-
-    It has to be the same cycle, at about the same place. The curve may have a corner there, so the
-    search goes all around the change, except where the curve came from.
-    """
-    condition, before, place = problem.condition, last[-2:], track.place(last)
-    known = problem.variation.oscillator(before), track.system, track.unknowns(last)
-    came_from = (before - centre) / max(float(np.linalg.norm(before - centre)), 1e-12)
-    best: tuple[float, BifurcationPoint, np.ndarray] | None = None
-    for free in (0, 1):
-        for side in (1.0, -1.0):
-            values = centre + side * 0.5 * problem.step * np.eye(2)[1 - free]
-            held = problem.variation.held(1 - free, float(values[1 - free]))
-            for offset in (-1.0, -0.5, -0.25, 0.0, 0.25, 0.5, 1.0):
-                guess = float(values[free]) + offset * problem.step
-                point = condition.named_point_beside(held, guess, *known)
-                if point is None or is_elsewhere(point.place, place, FAR):
-                    continue
-                system, _ = point.condition.applied_to(point.oscillator).system_at(point)
-                if track.system.is_of_same_arcs(system):
-                    continue  # from before the change
-                if point.condition.lineage != condition.lineage:
-                    continue
-                at = values.copy()
-                at[free] = float(point.value)
-                inside = np.all((problem.limits[:, 0] <= at) & (at <= problem.limits[:, 1]))
-                away = at - centre
-                distance = float(np.linalg.norm(away))
-                fine = inside and 0 < distance < 3 * problem.step
-                if fine and (away / distance) @ came_from < 0.7:
-                    if best is None or distance < best[0]:
-                        best = distance, point, at
-    return None if best is None else best[1:]
-
-
-def _trail(problem: _Problem, track: Track, rows: list[_Row], u, end: Stop) -> Trail:
+def _trail(problem: CurveProblem, track: Track, rows: list[CurveRow], u, end: Stop) -> Trail:
     """The last stretch of a curve up to its point u."""
     values = np.array([row.values for row in rows[-3:]])
     return Trail(problem.variation, problem.step, values, track.system, track.unknowns(u), end)
 
 
-def _towards(problem: _Problem, last: np.ndarray, limit: SpecialPoint) -> list[_Row]:
+def _towards(problem: CurveProblem, last: np.ndarray, limit: SpecialPoint) -> list[CurveRow]:
     """Rows between the last one and a belt at rest, where the curve bends.
 
     Each is half as far from the end as the one before.
@@ -541,5 +517,5 @@ def _towards(problem: _Problem, last: np.ndarray, limit: SpecialPoint) -> list[_
             break
         guess[1 - held] = float(point.value)
         numbers = float(point.multiplier), float(point.residual)
-        rows.append(_Row(guess, type(point.condition), *numbers, point.place))
+        rows.append(CurveRow(guess, type(point.condition), *numbers, point.place))
     return rows

@@ -1,0 +1,133 @@
+"""How a curve of bifurcation points goes on where the signature changes: `beyond_change`."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..model.variations import Variation
+from .base import AbstractCondition, BifurcationPoint
+from .special import FAR, SpecialPoint, is_elsewhere
+from .tracks import Track
+
+#: How far from a change of signature the curve is searched for, in steps: the first distance, and
+#: at an edge the others, too, where it may bend sharply.
+BESIDE_CHANGE = (0.5, 0.1, 0.02)
+#: What is no farther from the chords between rows is on the curve, in steps: neighbouring tangents
+#: differ by 18 degrees at most.
+ON_CHORD = 0.05
+
+
+class CurveProblem(NamedTuple):
+    """What is followed: condition, among oscillators of a variation; within limits, [2, 2]."""
+
+    condition: AbstractCondition
+    variation: Variation
+    limits: np.ndarray
+    step: float
+    max_points: int
+
+    def contains(self, point: SpecialPoint) -> bool:
+        """Whether a point is in the span, up to rounding."""
+        slack = 1e-12 * np.ptp(self.limits, axis=1)
+        low, high = self.limits.T
+        return bool(np.all((low - slack <= point.values) & (point.values <= high + slack)))
+
+
+class CurveRow(NamedTuple):
+    """A row of a curve, see `BifurcationCurve`."""
+
+    values: np.ndarray
+    kind: type[AbstractCondition]
+    multiplier: float
+    residual: float
+    place: np.ndarray
+
+
+def beyond_change(
+    problem: CurveProblem,
+    track: Track,
+    rows: list[CurveRow],
+    last: np.ndarray,
+    centre: np.ndarray,
+    changes: list[SpecialPoint],
+) -> tuple[BifurcationPoint, np.ndarray] | None:
+    """The point of the same condition just beyond a change of signature, and where, or None.
+
+    It has to be the same cycle, at about the same place. The curve may have a corner there, so the
+    search goes all around the change, except where the curve came from; changes: the point of
+    codimension two, where known.
+    """
+    touches = any(one.kind == "EdgeTouch" for one in changes)
+    found = (
+        _near_change(problem, track, rows, last, centre, part * problem.step)
+        for part in (BESIDE_CHANGE if touches else BESIDE_CHANGE[:1])
+    )
+    return next((one for one in found if one is not None), None)
+
+
+def _near_change(
+    problem: CurveProblem,
+    track: Track,
+    rows: list[CurveRow],
+    last: np.ndarray,
+    centre: np.ndarray,
+    reach: float,
+) -> tuple[BifurcationPoint, np.ndarray] | None:
+    """See `beyond_change`; reach: the distance from the change along one of the parameters."""
+    condition, before, place = problem.condition, last[-2:], track.place(last)
+    known = problem.variation.oscillator(before), track.system, track.unknowns(last)
+    came_from = (before - centre) / max(float(np.linalg.norm(before - centre)), 1e-12)
+    best: tuple[float, BifurcationPoint, np.ndarray] | None = None
+    for free in (0, 1):
+        for side in (1.0, -1.0):
+            values = centre + side * reach * np.eye(2)[1 - free]
+            held = problem.variation.held(1 - free, float(values[1 - free]))
+            for offset in (-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0):
+                guess = float(values[free]) + offset * reach
+                point = condition.named_point_beside(held, guess, *known)
+                if point is None or is_elsewhere(point.place, place, FAR):
+                    continue
+                system, _ = point.condition.applied_to(point.oscillator).system_at(point)
+                if track.system.is_of_same_arcs(system):
+                    continue  # from before the change
+                if point.condition.lineage != condition.lineage:
+                    continue
+                at = values.copy()
+                at[free] = float(point.value)
+                inside = np.all((problem.limits[:, 0] <= at) & (at <= problem.limits[:, 1]))
+                away = at - centre
+                distance = float(np.linalg.norm(away))
+                fine = inside and 0 < distance < 6 * reach
+                passed = fine and _is_on(rows, at, point.place, ON_CHORD * problem.step)
+                if fine and not passed and (away / distance) @ came_from < 0.7:
+                    if best is None or distance < best[0]:
+                        best = distance, point, at
+    return None if best is None else best[1:]
+
+
+def _is_on(rows: list[CurveRow], at: np.ndarray, place: np.ndarray, near: float) -> bool:
+    """Whether a point is on the curve through some rows, and its motion about the same as there."""
+    away, part = from_chords(at, np.array([row.values for row in rows]))
+    for row in np.flatnonzero(away < near).tolist():
+        before, after = rows[row].place, rows[row + 1].place
+        if not is_elsewhere(place, before + part[row] * (after - before), FAR):
+            return True
+    return False
+
+
+def _from_chords(at: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance of a point from each chord of a path, and the part of the chord where it is,
+    [chords]."""
+    a, chord = path[:-1], np.diff(path, axis=0)
+    along = np.sum((at - a) * chord, axis=1) / np.maximum(np.sum(chord**2, axis=1), 1e-300)
+    along = np.clip(along, 0, 1)
+    return np.hypot(*(at - a - along[:, None] * chord).T), along
+
+
+def from_chords(at: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance of a point from each chord of a path, and the part of the chord where it is,
+    [chords]."""
+    a, chord = path[:-1], np.diff(path, axis=0)
+    along = np.sum((at - a) * chord, axis=1) / np.maximum(np.sum(chord**2, axis=1), 1e-300)
+    along = np.clip(along, 0, 1)
+    return np.hypot(*(at - a - along[:, None] * chord).T), along
