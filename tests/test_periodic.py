@@ -837,3 +837,16 @@ def test_a_branch_does_not_come_back_on_its_own_way(shift):
     # It turns at both folds, and at the grazing point at -0.855.
     assert np.sum(np.diff(np.sign(np.diff(values))) != 0) == 3
     assert values[-1] == span[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("away", [0.0, 1e-9, -1e-9, 1e-3, -1e-3])
+def test_a_point_is_found_again_from_its_own_motion(away):
+    def osc(force):
+        belt = jb.Belt(0.1, jb.Coulomb(1.0, 0.6))
+        return jb.Oscillator(0.05, (belt,), forcing=jb.Harmonic(force, 1.5))
+
+    point = jb.refine(jb.AddingSliding(0), osc, at=0.95, start=(1.0, 0.0))
+    value = float(point.value)
+    again = jb.refine(jb.AddingSliding(0), osc, at=value + away, start=point.cycle)
+    assert int(again.status) == OK and float(again.value) == pytest.approx(value, abs=1e-12)

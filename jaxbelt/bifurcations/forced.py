@@ -249,12 +249,17 @@ def forced_point(
         "a traced one",
     )
     own, turns = in_own_units(near), turns_of(near)
-    found = [
-        point
-        for motion in motions_to_begin_from(own, start, turns)
-        for point in timed.points(variation, value, motion)
-    ]
-    fine = [point for point in found if int(point.status) == Status.OK]
+    motions = motions_to_begin_from(own, start, turns)
+
+    def points_from(motions):
+        found = [p for motion in motions for p in timed.points(variation, value, motion)]
+        return found, [point for point in found if int(point.status) == Status.OK]
+
+    found, fine = points_from(motions)
+    if isinstance(start, PeriodicMotion) and not fine:
+        # The arcs of a motion that is known may be those at another value, or at a point.
+        again = [periodic_from(own, np.asarray(m.start), m.periods, turns) for m in motions]
+        found, fine = points_from(m for m in again if int(m.status) == Status.OK)
     guess = float(np.asarray(lax.stop_gradient(value))[0])
     if fine:
         nearest = min(fine, key=lambda one: abs(float(lax.stop_gradient(one.value)) - guess))
