@@ -3,7 +3,8 @@
 Along random paths, those of the campaign `paths`, `scan` finds points. One of them is followed in
 the parameter of the path and a second one, drawn at random. On both sides of some of its rows,
 along the parameter across which the curve runs, the engine has other labels; it starts from many
-states, from the cycle that a row tells of, and from all that `portrait` finds beside.
+states, from the cycle that a row tells of, and from all that `portrait` finds beside. And with the
+parameters in the other order it has to be the same curve, with the same ends.
 """
 
 import jax
@@ -18,6 +19,9 @@ from .outcome import Outcome
 ROWS, BESIDE = 5, 2e-3
 #: Width of the span of the second parameter: of its size, and at least.
 WIDTH, LEAST = 0.3, 0.1
+#: Rows of one curve that are farther from the chords of another one, in units of the spans, are
+#: not on it: chords of bent curves are off by a tenth of a step.
+OFF = 3e-3
 #: Points of kinds at which no attractor and no equilibrium changes.
 SILENT = frozenset({"HopfAtInfinity", "SaddleConnection"})
 #: After so many paths compiled programs are dropped: a thousand of them fill the memory.
@@ -41,13 +45,37 @@ def outcome(options, number: int) -> Outcome:
     curve = jb.bifurcation_curve(point, (case.where, paths.selector(other)), (case.span, span))
     one.line += f", {other}: {curve!r}"
     one.counts["curves"] += 1
+    spans = np.array([case.span, span])
+    swapped = jb.bifurcation_curve(point, (paths.selector(other), case.where), (span, case.span))
+    off = max(
+        _off(curve.path, swapped.path[:, ::-1], spans),
+        _off(swapped.path[:, ::-1], curve.path, spans),
+    )
+    alike = off < OFF and {*curve.ends} == {*swapped.ends}
+    one.counts["in the other order the same" if alike else "in the other order another one"] += 1
+    if not alike:
+        both = f"{curve!r} {curve.ends}, {swapped!r} {swapped.ends}"
+        where = f"{case.oscillator!r}, {case.parameter}, {other}, {spans.tolist()}"
+        one.wrong.append(f"off by {off:.1e} in the other order: {both}\n    {where}")
     for row in sorted({int(row) for row in np.linspace(0, len(curve) - 1, ROWS + 2)[1:-1]}):
-        verdict, sides = _beside(case, other, curve, row, np.array([case.span, span]), rng)
+        verdict, sides = _beside(case, other, curve, row, spans, rng)
         one.counts[verdict] += 1
         if verdict == "nothing changes":
             said = f"{verdict} at row {row}, {curve.values[row].tolist()}, of {curve!r}: {sides}"
             one.wrong.append(f"{said}\n    {case.oscillator!r}, {case.parameter}, {other}")
     return one
+
+
+def _off(path: np.ndarray, other: np.ndarray, spans: np.ndarray) -> float:
+    """The largest distance of the points of a path from the chords of another one."""
+    at, chords = (one / np.ptp(spans, axis=1) for one in (path, other))
+    if len(chords) < 2:
+        return float(np.max(np.hypot(*(at - chords[0]).T)))
+    begin, along = chords[:-1], np.diff(chords, axis=0)
+    away = at[:, None] - begin
+    part = np.sum(away * along, axis=-1) / np.maximum(np.sum(along**2, axis=-1), 1e-300)
+    away -= np.clip(part, 0, 1)[..., None] * along
+    return float(np.max(np.min(np.linalg.norm(away, axis=-1), axis=1)))
 
 
 def _second(case: paths.Case, rng) -> tuple[tuple[int, str], tuple[float, float]]:
