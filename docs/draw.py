@@ -165,8 +165,22 @@ def circle_map():
     return figure
 
 
+def forced_curves():
+    """Curves of a forced oscillator that meet in a point where two conditions hold."""
+    oscillator, span = jb.presets.di_bernardo, ((1.6, 1.9), (0.02, 0.2))
+    figure = journal_figure(5.2, 3.6)
+    ax = figure.subplots()
+    conditions = {1.6676: jb.GrazingSliding(0), 1.7078: jb.GrazingSliding(0)}
+    conditions |= {1.6834: jb.Fold(), 1.713: jb.PeriodDoubling()}
+    for frequency, condition in conditions.items():
+        point = jb.refine(condition, oscillator, at=frequency)
+        jb.bifurcation_curve(point, oscillator, span).plot(ax)
+    return figure
+
+
 GALLERY = [model, region_map, history, phase_plane, diagram, orbit_diagram, basins]
 GALLERY += [basin_fractions, portrait, curve, period_map, vector_field, friction_laws, circle_map]
+GALLERY += [forced_curves]
 
 # --- bifurcations ---------------------------------------------------------------------------------
 

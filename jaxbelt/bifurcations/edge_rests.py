@@ -51,7 +51,7 @@ from ..numerics.newton import HOLDS
 from ..results import Status
 from .base import AbstractCondition, Line
 from .rests import NOTHING, AbstractRestOfSeveral, criticality, limit_near
-from .special import SpecialPoint, Trail
+from .special import SpecialPoint, Trail, extrapolated_to_zero
 from .systems import RestSystem, Tests, small_newton
 
 #: A cycle around a pseudo-focus is as large as a velocity if the range of its x2 is at most so many
@@ -250,7 +250,7 @@ def slow_focus_limit(trail: Trail, belt: int) -> SpecialPoint | None:
         found, residual = _slow_focus(family, EdgeBalance(edge, *sides), number, guess)
         return (found, residual), (found,)
 
-    ahead = [np.polyval(np.polyfit(v, column, 2), 0.0) for column in trail.values.T]
+    ahead = extrapolated_to_zero(v, trail.values)
     guess = (trail.values[-1],)
     return limit_near(trail, attempt, guess, ahead, 3 * trail.step, "BeltAtRest", belt)
 

@@ -87,6 +87,13 @@ def is_elsewhere(place: np.ndarray, other: np.ndarray, far: float) -> bool:
     return bool(distance(place[:4], other[:4], least=far) > far)
 
 
+def extrapolated_to_zero(x: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """What the polynomial through values at some x, [rows] or [rows, k], has at zero."""
+    from scipy.interpolate import KroghInterpolator  # half a second that only curves need
+
+    return np.asarray(KroghInterpolator(x, values)(0.0))
+
+
 def where_belts_stop(
     variation: Variation, values: np.ndarray, near: float, far: float
 ) -> SpecialPoint | None:
@@ -119,10 +126,7 @@ def where_belts_stop(
         error = 0.0
     else:
         part = v[stop[0]] / v[stop[0], 2]
-        line, at = (
-            np.array([np.polyval(np.polyfit(part[-n:], row[-n:], n - 1), 0.0) for row in values.T])
-            for n in (2, 3)
-        )
+        line, at = (extrapolated_to_zero(part[-n:], values[-n:]) for n in (2, 3))
         error = float(np.max(np.abs(at - line)))
     if np.linalg.norm(at - values[-1]) > far:
         return None

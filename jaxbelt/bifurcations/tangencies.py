@@ -39,7 +39,7 @@ from .base import Line
 from .conditions import AbstractStickCondition
 from .forced import TimedGrazing
 from .guesses import HINT_BUDGET, least_push, orbit_after_stick
-from .special import SpecialPoint
+from .special import SpecialPoint, extrapolated_to_zero
 from .systems import (
     CycleSystem,
     contact_tests,
@@ -166,7 +166,7 @@ class AbstractTangency(AbstractStickCondition):
         if stopping is None:
             return None
         held, free = stopping.held, trail.values[:, 1 - stopping.held]
-        guess = np.polyval(np.polyfit(stopping.velocities, free, 2), 0.0)
+        guess = extrapolated_to_zero(stopping.velocities, free)
         belts = jnp.asarray(stopping.belt), jnp.asarray(self.belt)
         # A cycle begins at the end of its longest stick phase, which is the one on that belt.
         codes = jnp.asarray(np.asarray(trail.system.chain.codes)[0])

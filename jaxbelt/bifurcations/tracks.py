@@ -18,7 +18,7 @@ from ..model.variations import Variation
 from ..numerics.compiling import jit
 from ..numerics.continuation import Corrected, CurvePoint, corrected
 from .base import BifurcationPoint
-from .special import SpecialPoint
+from .special import SpecialPoint, extrapolated_to_zero
 from .systems import AbstractSystem, Seen
 
 #: How often, at most, the points on both sides of a singular one are brought nearer to it by half.
@@ -204,8 +204,6 @@ def _from_both_sides(probe: Callable[[float], _Probe], low: _Probe, high: _Probe
     An example is a curve whose cycle shrinks to a point: with all arcs of duration zero its
     equations are singular.
     """
-    from scipy.interpolate import KroghInterpolator
-
     known = [low, high]
     for _ in range(SHRINKS):
         middle = low.part - low.test * (high.part - low.part) / (high.test - low.test)
@@ -219,8 +217,8 @@ def _from_both_sides(probe: Callable[[float], _Probe], low: _Probe, high: _Probe
         low, high = nearer
 
     def at_zero(probes):
-        numbers = [np.array([probe.part, *probe.values]) for probe in probes]
-        return KroghInterpolator([probe.test for probe in probes], numbers)(0.0)
+        numbers = np.array([[probe.part, *probe.values] for probe in probes])
+        return extrapolated_to_zero(np.array([probe.test for probe in probes]), numbers)
 
     best, other = at_zero(known[-6:]), at_zero(known[-4:])
     residual = float(np.max(np.abs(best - other))) if len(known) > 4 else np.nan
