@@ -77,7 +77,7 @@ def _near_change(
     condition, before, place = problem.condition, last[-2:], track.place(last)
     known = problem.variation.oscillator(before), track.system, track.unknowns(last)
     came_from = (before - centre) / max(float(np.linalg.norm(before - centre)), 1e-12)
-    best: tuple[float, BifurcationPoint, np.ndarray] | None = None
+    found: list[tuple[float, BifurcationPoint, np.ndarray]] = []
     for free in (0, 1):
         for side in (1.0, -1.0):
             values = centre + side * reach * np.eye(2)[1 - free]
@@ -87,9 +87,6 @@ def _near_change(
                 point = condition.named_point_beside(held, guess, *known)
                 if point is None or is_elsewhere(point.place, place, FAR):
                     continue
-                system, _ = point.condition.applied_to(point.oscillator).system_at(point)
-                if track.system.is_of_same_arcs(system):
-                    continue  # from before the change
                 if point.condition.lineage != condition.lineage:
                     continue
                 at = values.copy()
@@ -97,12 +94,14 @@ def _near_change(
                 inside = np.all((problem.limits[:, 0] <= at) & (at <= problem.limits[:, 1]))
                 away = at - centre
                 distance = float(np.linalg.norm(away))
-                fine = inside and 0 < distance < 6 * reach
-                passed = fine and _is_on(rows, at, point.place, ON_CHORD * problem.step)
-                if fine and not passed and (away / distance) @ came_from < 0.7:
-                    if best is None or distance < best[0]:
-                        best = distance, point, at
-    return None if best is None else best[1:]
+                if inside and 0 < distance < 6 * reach and (away / distance) @ came_from < 0.7:
+                    found.append((distance, point, at))
+    for _, point, at in sorted(found, key=lambda one: one[0]):
+        system, _ = point.condition.applied_to(point.oscillator).system_at(point)
+        passed = _is_on(rows, at, point.place, ON_CHORD * problem.step)
+        if not passed and not track.system.is_of_same_arcs(system):
+            return point, at
+    return None
 
 
 def _is_on(rows: list[CurveRow], at: np.ndarray, place: np.ndarray, near: float) -> bool:
