@@ -36,6 +36,7 @@ from ..results import Status, draw
 from ..tables import table_of
 from .base import AbstractCondition, BifurcationPoint
 from .changes import CurveProblem, CurveRow, beyond_change
+from .forced import AbstractForcedCondition
 from .forced_ends import meeting_point
 from .special import (
     CREEPS,
@@ -355,7 +356,9 @@ def _side(
         changes = leg.at_change
         if not points or end is Stop.STEP_TOO_SMALL:
             trail = trail._replace(end=Stop.STEP_TOO_SMALL)
-            changes = _just_ahead(seen_last, problem.step)
+            # What is watched with forcing does not change the signature.
+            is_forced = isinstance(problem.condition, AbstractForcedCondition)
+            changes = [] if is_forced else _just_ahead(seen_last, problem.step)
             special += changes
             if not changes:
                 return _ended(problem, rows, special, trail)

@@ -183,7 +183,7 @@ class AbstractForcedCondition(AbstractCondition):
         chain, at = system.chain, np.array([value])
         start, periods = state_at_phase_0(osc, chain, jnp.asarray(x)), periods_of(chain)
         motion = periodic_from(variation.oscillator(at), start, periods, chain.turns)
-        if int(motion.status) != Status.OK:
+        if int(motion.status) != Status.OK or motion.periods != periods:
             return None
         found = [p for p in self.points(variation, at, motion) if int(p.status) == Status.OK]
         nearest = min(found, key=lambda point: abs(float(point.value) - value), default=None)
