@@ -456,3 +456,8 @@ def test_portraits_show_what_the_paper_says_of_the_regions(values):
         "fig12": ["01", "1"],
         "fig13": ["1", "fold", ""],
     }
+
+
+def test_a_force_of_frequency_zero_is_no_forcing():
+    assert not Description(force=["0.3,0"]).is_forced
+    assert Description(force=["0.3,0", "0.1,1.2"]).is_forced

@@ -115,9 +115,9 @@ class Description:
 
     @property
     def is_forced(self) -> bool:
-        """Whether the oscillator is forced."""
+        """Whether the oscillator is forced; a force of the frequency 0 is constant."""
         if self.source is None:
-            return bool(self.force)
+            return any(parts_of_force(one)[1] != 0 for one in self.force or ())
         from ..model.oscillator import has_clock
 
         return has_clock(self.source.own)

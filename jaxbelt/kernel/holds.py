@@ -75,16 +75,16 @@ def hold_from(osc: Oscillator, mode: Mode, asked: Array, x1, x2, t, remaining) -
     n, now = len(osc.belts), at_time(osc, t)
     waves = [_wave(osc, one, t) for one in osc.forcing if not isinstance(one, ConstantForce)]
     limit, zero = capacity(now, mode), jnp.zeros_like(x1)
-    bend = sum((jnp.abs(a) * w * w for a, w, _ in waves), zero + LEAST_DIVISOR)
+    bend = sum((wave.size * wave.frequency**2 for wave in waves), zero + LEAST_DIVISOR)
     fuzz = NEEDED_ROUNDING * blur(t) * (1 + limit + jnp.abs(x1))
     rest = mode_acceleration(now, mode, x1, x2)
-    rest = rest - sum((a * cosine_and_sine(theta)[0] for a, _, theta in waves), zero)
+    rest = rest - sum((wave.after(zero)[0] for wave in waves), zero)
 
     def needed_at(tau):
         value, slope = rest - x2 * tau, -x2
-        for a, w, theta in waves:
-            cosine, sine = cosine_and_sine(theta + w * tau)
-            value, slope = value + a * cosine, slope - a * w * sine
+        for wave in waves:
+            push, change = wave.after(tau)
+            value, slope = value + push, slope + change
         return value, slope
 
     to_edge, edge = zero + jnp.inf, jnp.full_like(zero, -1, dtype=int)
@@ -143,10 +143,32 @@ def hold_from(osc: Oscillator, mode: Mode, asked: Array, x1, x2, t, remaining) -
     return FirstEnd(jnp.where(at_edge, to_edge, jnp.minimum(tau, remaining)), number)
 
 
-def _wave(osc: Oscillator, force, t: Array) -> tuple[Array, Array, Array]:
-    """Amplitude and frequency of a force on the mass, and its angle at the time t."""
-    amplitude, angle = force.amplitude, force.frequency * t + force.phase
-    if isinstance(force, BaseMotion):
-        turn = osc.damping * force.frequency
-        return amplitude * jnp.sqrt(1 + turn * turn), force.frequency, angle + jnp.arctan(turn)
-    return amplitude, force.frequency, angle
+class _PhaseWave(NamedTuple):
+    """A force on the mass, amplitude (cos u - turn sin u), u = angle + frequency tau, where tau is
+    the time since the phase began; turn: of a `BaseMotion`, else None."""
+
+    amplitude: Array
+    frequency: Array
+    angle: Array
+    turn: Array | None
+
+    @property
+    def size(self) -> Array:
+        """The largest value of the force."""
+        size = jnp.abs(self.amplitude)
+        return size if self.turn is None else size * jnp.sqrt(1.0 + self.turn * self.turn)
+
+    def after(self, tau: Array) -> tuple[Array, Array]:
+        """The force at tau, and its derivative."""
+        cosine, sine = cosine_and_sine(self.angle + self.frequency * tau)
+        if self.turn is not None:
+            # As one cosine it has the phase arctan(turn), which XLA left out of some programs for
+            # the CPU (jaxlib 0.10.2).
+            cosine, sine = cosine - self.turn * sine, sine + self.turn * cosine
+        return self.amplitude * cosine, -self.amplitude * self.frequency * sine
+
+
+def _wave(osc: Oscillator, force, t: Array) -> _PhaseWave:
+    """A force on the mass from the time t on."""
+    turn = osc.damping * force.frequency if isinstance(force, BaseMotion) else None
+    return _PhaseWave(force.amplitude, force.frequency, force.frequency * t + force.phase, turn)

@@ -13,6 +13,7 @@ of two changes no bit but exponents.
 A field of a result that has a dimension says so by `quantity`; `in_given_units` reads that.
 """
 
+import contextlib
 import dataclasses
 import functools
 import operator
@@ -103,7 +104,10 @@ def own_length(osc: Oscillator) -> Any:
             one.where(load > 0, one.abs(largest(belt.velocity)) / number(osc.omega), 0.0)
             for load, belt in zip(loads, osc.belts)
         ]
-        pushes = [number(force.bound(osc.damping)) for force in osc.forcing]
+        # Known numbers are so in a trace, too.
+        known = jax.ensure_compile_time_eval() if is_concrete(osc) else contextlib.nullcontext()
+        with known:
+            pushes = [number(force.bound(osc.damping)) for force in osc.forcing]
         lengths += [one.where(one.isfinite(push), push, 0.0) for push in pushes]
         inner = functools.reduce(one.maximum, [*lengths, *speeds])
         is_cut = functools.reduce(operator.or_, cuts, np.asarray(False))
