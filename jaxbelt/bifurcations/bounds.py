@@ -21,12 +21,12 @@ from ..numerics.continuation import Stop
 from ..numerics.widths import as_here
 from ..results import Status
 from .base import BifurcationPoint
-from .changes import from_chords
+from .changes import from_chords, is_on_rows
 from .curves import BifurcationCurve, follow_point
 from .faces import densely
 from .path import ParameterPath
 from .scan import calls_ahead, search
-from .special import FAR, SpecialPoint, is_elsewhere
+from .special import SpecialPoint, is_elsewhere
 
 #: A curve bounds two neighbouring cells if it passes the line between them this near, in cells:
 #: chords of a bent curve are off by less.
@@ -310,9 +310,4 @@ def _lies_on(
     """Whether a point is on a known curve."""
     if point.condition.lineage != curve.condition.lineage:
         return False
-    away, along = from_chords(at / unit, curve.values / unit)
-    places = curve.places[:-1] + along[:, None] * np.diff(curve.places, axis=0)
-    own = point.place
-    return any(
-        not is_elsewhere(own, places[i], FAR) for i in np.flatnonzero(away < 0.3 * step).tolist()
-    )
+    return is_on_rows(at / unit, point.place, curve.values / unit, curve.places, 0.3 * step)

@@ -49,6 +49,7 @@ from .forced import (
 from .forced_ends import borders_of
 from .systems import WEIGHT
 from .tangencies import GrazingSliding
+from .timed_systems import unit_circle_tests
 from .tracks import corrected_among
 
 #: First, shortest and longest step, of which the parameter's part is measured in parts of the span.
@@ -353,10 +354,8 @@ def _at_end(
 
 def _tests(motion: PeriodicMotion) -> dict[type[AbstractForcedCondition], float]:
     """Functions that vanish at the points where multipliers meet the unit circle."""
-    first, second = np.asarray(motion.multipliers)
-    trace, det = (first + second).real, (first * second).real
-    torus = det - 1 if first.imag != 0 else np.nan
-    return {PeriodDoubling: 1 + trace + det, Fold: 1 - trace + det, Torus: torus}
+    tests = unit_circle_tests(motion)
+    return {kind: float(tests[kind.__name__]) for kind in (PeriodDoubling, Fold, Torus)}
 
 
 def _points_between(

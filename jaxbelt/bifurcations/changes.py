@@ -96,31 +96,27 @@ def _near_change(
                 distance = float(np.linalg.norm(away))
                 if inside and 0 < distance < 6 * reach and (away / distance) @ came_from < 0.7:
                     found.append((distance, point, at))
+    curve = np.array([row.values for row in rows]), np.array([row.place for row in rows])
     for _, point, at in sorted(found, key=lambda one: one[0]):
         system, _ = point.condition.applied_to(point.oscillator).system_at(point)
-        passed = _is_on(rows, at, point.place, ON_CHORD * problem.step)
-        if not passed and not track.system.is_of_same_arcs(system):
+        passed = is_on_rows(at, point.place, *curve, ON_CHORD * problem.step)
+        if not passed and not track.system.has_signature_of(system):
             return point, at
     return None
 
 
-def _is_on(rows: list[CurveRow], at: np.ndarray, place: np.ndarray, near: float) -> bool:
-    """Whether a point is on the curve through some rows, and its motion about the same as there."""
-    away, part = from_chords(at, np.array([row.values for row in rows]))
-    for row in np.flatnonzero(away < near).tolist():
-        before, after = rows[row].place, rows[row + 1].place
-        if not is_elsewhere(place, before + part[row] * (after - before), FAR):
-            return True
-    return False
+def is_on_rows(
+    at: np.ndarray, place: np.ndarray, values: np.ndarray, places: np.ndarray, near: float
+) -> bool:
+    """Whether a point is nearer than that to a curve, and its motion about the same as there.
 
-
-def _from_chords(at: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance of a point from each chord of a path, and the part of the chord where it is,
-    [chords]."""
-    a, chord = path[:-1], np.diff(path, axis=0)
-    along = np.sum((at - a) * chord, axis=1) / np.maximum(np.sum(chord**2, axis=1), 1e-300)
-    along = np.clip(along, 0, 1)
-    return np.hypot(*(at - a - along[:, None] * chord).T), along
+    at, place: of the point, [2] and [5]; values, places: of the rows of the curve, [rows, ..].
+    """
+    away, part = from_chords(at, values)
+    between = places[:-1] + part[:, None] * np.diff(places, axis=0)
+    return any(
+        not is_elsewhere(place, between[i], FAR) for i in np.flatnonzero(away < near).tolist()
+    )
 
 
 def from_chords(at: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -383,8 +383,8 @@ def _side(
 
 
 def _just_ahead(seen: list[tuple[CurvePoint, Seen]], step: float) -> list[SpecialPoint]:
-    """The point of codimension two just behind the last one of two points, by a line through what
-    is watched; the residual is its distance from there.
+    """The point of codimension two just ahead of the last of two points, where a line through the
+    values of a watched function vanishes; its residual is its distance from the last point.
 
     Where an arc begins or ends on an edge its duration goes like a square root, so no step leads
     there.

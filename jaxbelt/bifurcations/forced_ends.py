@@ -87,10 +87,7 @@ def _zeros_along(
             seen = ((at, track.seen_at(at.u)) for at in points)
             for before, after in pairwise(seen):
                 for special in special_between(track, anywhere, before, after):
-                    if (
-                        special.kind == kind
-                        and _from_last_row(trail, special.values) < REACH * trail.step
-                    ):
+                    if special.kind == kind and _is_near(trail, special.values):
                         yield special
 
 
@@ -104,10 +101,7 @@ def _points_near(
         for point in condition.points(along, last[free : free + 1], motion):
             values = last.copy()
             values[free] = float(point.value)
-            if (
-                int(point.status) == Status.OK
-                and _from_last_row(trail, values) < REACH * trail.step
-            ):
+            if int(point.status) == Status.OK and _is_near(trail, values):
                 yield replace(point, condition=condition), values
                 return
 

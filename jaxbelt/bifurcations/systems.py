@@ -68,8 +68,8 @@ class Seen(NamedTuple):
 class AbstractSystem(eqx.Module):
     """Equations in the unknowns of a motion, one more than there are unknowns."""
 
-    def is_of_same_arcs(self, other: "AbstractSystem") -> bool:
-        """Whether another system has the same signature; what has none has another one."""
+    def has_signature_of(self, other: "AbstractSystem") -> bool:
+        """Whether both are of one signature; False for states of rest, which have none."""
         return False
 
     @abc.abstractmethod
@@ -172,8 +172,8 @@ class AbstractChainSystem(AbstractSystem):
     def error_of_steps(self, osc: Oscillator, x: Array) -> Array:
         """The error of the integration steps in the equations of each arc at x, [N]."""
 
-    def is_of_same_arcs(self, other: AbstractSystem) -> bool:
-        """Whether another system has the same arcs, and the same numbers of arcs, belts, edges."""
+    def has_signature_of(self, other: AbstractSystem) -> bool:
+        """Whether both have the same arcs, and ask the same of the same arc, belt and edge."""
         if type(other) is not type(self):
             return False
         own, others = _numbers_in(self), _numbers_in(other)

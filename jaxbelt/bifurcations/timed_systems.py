@@ -73,14 +73,8 @@ class TimedSystem(AbstractChainSystem):
         return Seen(self.tests(motion), exists, jnp.real(motion.multipliers[0]), error)
 
     def tests(self, motion: PeriodicMotion) -> Tests:
-        """Functions to watch along a curve, see `Seen`: where multipliers meet the unit circle."""
-        trace, det = _trace_and_determinant(motion)
-        is_pair = jnp.imag(motion.multipliers[0]) != 0
-        return {
-            ("PeriodDoubling", ()): 1 + trace + det,
-            ("Fold", ()): 1 - trace + det,
-            ("Torus", ()): jnp.where(is_pair, det - 1, jnp.nan),
-        }
+        """Functions to watch along a curve, see `Seen`."""
+        return {(kind, ()): value for kind, value in unit_circle_tests(motion).items()}
 
     def motion(self, osc: Oscillator, x: Any) -> PeriodicMotion:
         """The motion with the unknowns x of a solution, without its multipliers."""
@@ -130,15 +124,16 @@ class OnUnitCircle(TimedSystem):
 
     def tests(self, motion):
         trace, det = _trace_and_determinant(motion)
+        multipliers = unit_circle_tests(motion)
         on_fold, on_torus, on_doubling = (self.parts[1] == sign for sign in (-1, 0, 1))
 
         def on(wanted, value):
             return jnp.where(wanted, value, jnp.nan)
 
         return {
-            ("PeriodDoubling", ()): on(on_fold, 1 + trace + det),
-            ("Fold", ()): on(on_doubling, 1 - trace + det),
-            # Of a torus the multipliers are a pair up to there; on other curves both are the same.
+            ("PeriodDoubling", ()): on(on_fold, multipliers["PeriodDoubling"]),
+            ("Fold", ()): on(on_doubling, multipliers["Fold"]),
+            # On other curves than that of a torus both multipliers are real, and equal there.
             ("Resonance1to1", ()): jnp.where(on_torus, trace - 2, on(on_fold, det - 1)),
             ("Resonance1to2", ()): jnp.where(on_torus, trace + 2, on(on_doubling, det - 1)),
             ("Resonance1to3", ()): on(on_torus, trace + 1),
@@ -194,6 +189,14 @@ class AtLimit(TimedSystem):
         arrives = (self.rises == 0) | (guard_slope(osc, codes, end, y) < -ARRIVES)
         fits = (self.rises * rises >= 0) & arrives
         return first_failure(motion.status, fits, Status.OTHER_KIND)
+
+
+def unit_circle_tests(motion: PeriodicMotion) -> dict[str, Array]:
+    """Functions that vanish where multipliers meet the unit circle, by the kind of the point."""
+    trace, det = _trace_and_determinant(motion)
+    is_pair = jnp.imag(motion.multipliers[0]) != 0
+    torus = jnp.where(is_pair, det - 1, jnp.nan)
+    return {"PeriodDoubling": 1 + trace + det, "Fold": 1 - trace + det, "Torus": torus}
 
 
 def _trace_and_determinant(motion: PeriodicMotion) -> tuple[Array, Array]:

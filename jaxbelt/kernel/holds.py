@@ -29,7 +29,7 @@ from ..model.modes import (
     mode_acceleration,
 )
 from ..model.oscillator import Oscillator, at_time
-from .waves import cosine_and_sine
+from .waves import along_and_across, turn_of
 
 #: Rounding of what is needed, over its size.
 NEEDED_ROUNDING = 1e-13
@@ -145,7 +145,7 @@ def hold_from(osc: Oscillator, mode: Mode, asked: Array, x1, x2, t, remaining) -
 
 class _PhaseWave(NamedTuple):
     """A force on the mass, amplitude (cos u - turn sin u), u = angle + frequency tau, where tau is
-    the time since the phase began; turn: of a `BaseMotion`, else None."""
+    the time since the phase began; see `turn_of`."""
 
     amplitude: Array
     frequency: Array
@@ -160,15 +160,11 @@ class _PhaseWave(NamedTuple):
 
     def after(self, tau: Array) -> tuple[Array, Array]:
         """The force at tau, and its derivative."""
-        cosine, sine = cosine_and_sine(self.angle + self.frequency * tau)
-        if self.turn is not None:
-            # As one cosine it has the phase arctan(turn), which XLA left out of some programs for
-            # the CPU (jaxlib 0.10.2).
-            cosine, sine = cosine - self.turn * sine, sine + self.turn * cosine
+        cosine, sine = along_and_across(self.angle + self.frequency * tau, self.turn)
         return self.amplitude * cosine, -self.amplitude * self.frequency * sine
 
 
 def _wave(osc: Oscillator, force, t: Array) -> _PhaseWave:
     """A force on the mass from the time t on."""
-    turn = osc.damping * force.frequency if isinstance(force, BaseMotion) else None
-    return _PhaseWave(force.amplitude, force.frequency, force.frequency * t + force.phase, turn)
+    angle = force.frequency * t + force.phase
+    return _PhaseWave(force.amplitude, force.frequency, angle, turn_of(osc, force))

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array
 
 from ..model.forcing import AbstractForce, BaseMotion, ConstantForce, Harmonic, Oscillating
 from ..model.modes import Mode, foremost
@@ -60,6 +60,23 @@ def _even(y: Array, coefficients: Sequence[float]) -> Array:
     for c in reversed(coefficients[:-1]):
         total = total * y + c
     return total
+
+
+def turn_of(osc: Oscillator, force: AbstractForce) -> Array | None:
+    """Of a `BaseMotion`, on the mass a wave cos u - turn sin u; None of a cosine."""
+    return osc.damping * force.frequency if isinstance(force, BaseMotion) else None
+
+
+def along_and_across(angle: Array, turn: Array | None) -> tuple[Array, Array]:
+    """cos u - turn sin u at the angle u, and minus its derivative; see `turn_of`.
+
+    As one cosine it would have the phase arctan(turn), which XLA left out of some programs for the
+    CPU (jaxlib 0.10.2).
+    """
+    cosine, sine = cosine_and_sine(angle)
+    if turn is None:
+        return cosine, sine
+    return cosine - turn * sine, sine + turn * cosine
 
 
 class StepWave(NamedTuple):
@@ -126,10 +143,8 @@ class StepClock(NamedTuple):
         """That of the lanes' next steps."""
         middle = t + 0.5 * h
 
-        def wave(mean, amplitude, frequency, phase, turn: ArrayLike = 0.0):
-            """`turn`: of a `BaseMotion`, amplitude (cos - turn sin)."""
-            cosine, sine = cosine_and_sine(frequency * middle + phase)
-            along, across = cosine - turn * sine, sine + turn * cosine
+        def wave(mean, amplitude, frequency, phase, turn=None):
+            along, across = along_and_across(frequency * middle + phase, turn)
             along = materialise(amplitude * along, ones)
             across = materialise(amplitude * across, ones)
             return StepWave(mean, along, across, materialise(frequency * h, ones), frequency)
@@ -139,7 +154,7 @@ class StepClock(NamedTuple):
             if isinstance(one, ConstantForce):
                 forces.append(_Constant(one.push))
             elif isinstance(one, Harmonic | BaseMotion):
-                turn = osc.damping * one.frequency if isinstance(one, BaseMotion) else 0.0
+                turn = turn_of(osc, one)
                 forces.append(wave(0.0, one.amplitude, one.frequency, one.phase, turn))
             else:
                 others.append(one)
