@@ -23,6 +23,7 @@ from ..model.variations import Variation, varied
 from ..numerics.compiling import compiled_beside, is_outermost
 from ..results import Status
 from .base import AbstractCondition, BifurcationPoint, given_point
+from .conditions import AbstractCycleCondition
 from .forced import forced_point
 from .path import ParameterPath
 from .scan import MOST_ATTEMPTS, more_exact, search
@@ -103,9 +104,10 @@ def refine(
     variation, near, value = _begun(condition, osc, where, at)
     if has_clock(near):
         return given_point(forced_point(condition, variation, value, start), variation)
-    with compiled_beside(
-        "refine", (near, value), [partial(_label_near, condition, variation, value)]
-    ):
+    # Points of cycles take long to compile, and many of them are bracketed afterwards.
+    of_cycle = isinstance(condition, AbstractCycleCondition)
+    ahead = [partial(_label_near, condition, variation, value)] if of_cycle else []
+    with compiled_beside("refine", (condition, near, value), ahead):
         point = condition.point(variation, near, value, room or condition.room)
     if not is_outermost(near, value, point):
         return given_point(point, variation)
