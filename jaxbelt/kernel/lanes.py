@@ -19,8 +19,9 @@ from ..model.own_units import OwnOscillator
 from ..numerics.compiling import where_any
 from ..numerics.widths import is_cpu
 
-#: Lanes that `in_few` serves at once: of 128 some twenty come to an event between two looks.
-SERVED = 32
+#: Lanes that `in_few` serves at once: of 128 some thirty come to an event between two looks, and as
+#: one force drives them all, at times more; who is not served waits for four steps.
+SERVED = 48
 #: A motion this large grows beyond all bounds. The cube of a velocity above 5.6e102, which Conti's
 #: law takes, is no longer a number; there steps become ever smaller.
 GROWN = 1e100
