@@ -31,9 +31,9 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     sweeps/         clusters sweep shares
     sweeps/         naming forced_basins basins fractions orbit_diagram circle_map
     bifurcations/   special labels beside systems timed_systems guesses base conditions forced
-    bifurcations/   tangencies crossings rests edge_rests edges folds meetings connections
-    bifurcations/   infinity path scan refine tracks forced_ends changes curves cells faces bounds
-    bifurcations/   regions branches pieces diagrams switch_folds
+    bifurcations/   forced_edges tangencies crossings rests edge_rests edges folds meetings
+    bifurcations/   connections infinity path scan refine tracks forced_ends changes curves cells
+    bifurcations/   faces bounds regions branches pieces diagrams switch_folds
     inverse/        selection record search windows fit margins design
     si              results in SI units
     plotting/       style phase histories forced points diagrams regions categories sweeps orbits

@@ -460,8 +460,8 @@ def _past_corner(
 
 def _borders(line: ForcedLine, row: MotionRow) -> list[BifurcationPoint]:
     """Points near to a motion in which its signature may end."""
-    belts = row.motion.chain.codes.shape[-1]
-    return [point for one in borders_of(belts) for point in _points(line, one, row)]
+    borders = borders_of(line.at(row.value))
+    return [point for one in borders for point in _points(line, one, row)]
 
 
 def _border(

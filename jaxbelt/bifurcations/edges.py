@@ -37,6 +37,7 @@ from .base import Line
 from .conditions import AbstractCycleCondition
 from .crossings import arrival_tests
 from .edge_rests import check_edge, slow_focus_limit
+from .forced_edges import TimedEdgeGrazing
 from .guesses import nearest, without_arcs
 from .rests import hopf_limit
 from .systems import CycleSystem, nearest_edge
@@ -229,6 +230,10 @@ class GrazingEdge(AbstractEdgeTouch):
     @property
     def repels(self):
         return self.unstable
+
+    def with_clock(self):
+        require_value(not self.unstable, "condition", "stable, as osc is forced", self)
+        return TimedEdgeGrazing(int(self.belt), type(self))
 
     @classmethod
     def between(cls, before, after, edged):

@@ -385,9 +385,9 @@ class TimedGrazing(AbstractForcedCondition):
             yield Beginning(rows, 0.0, system(row))
             return
         short = [row for row in range(1, len(rows.ends) - 1) if self._may_end(rows, row)]
-        for shorter, row, value in _left_out(rows, short, names.tangent + k):
+        for shorter, row, value in without_one_of(rows, short, names.tangent + k):
             yield Beginning(shorter, value, system(row))
-        for row, since, state, value in _turns(osc, motion, lambda guards: guards[k : k + 1]):
+        for row, since, state, value in minima_of_guards(osc, motion, slice(k, k + 1)):
             if abs(rows.codes[row, k]) == 1:
                 cut = rows.cut(row, since, state, names.tangent + k)
                 yield Beginning(cut, value, system(row))
@@ -526,9 +526,9 @@ class AddingSliding(AbstractForcedCondition):
             alone = before[k] == STUCK and np.all(before == after) and abs(here[k]) == 1
             if alone and rows.ends[row - 1] == names.onset and rows.ends[row] == k:
                 short.append(row)
-        for shorter, row, value in _left_out(rows, short, names.nearest_limit):
+        for shorter, row, value in without_one_of(rows, short, names.nearest_limit):
             yield Beginning(shorter, value, system(row, shorter.codes[row]))
-        for row, since, state, value in _turns(osc, motion, lambda guards: guards[-2:]):
+        for row, since, state, value in minima_of_guards(osc, motion, slice(-2, None)):
             if rows.codes[row, k] == STUCK:
                 cut = rows.cut(row, since, state, names.nearest_limit)
                 yield Beginning(cut, value, system(row, rows.codes[row]))
@@ -546,7 +546,9 @@ def friction_jumps(osc: Oscillator, belt: int) -> bool:
     return float(law.static - law.mu(jnp.zeros(()))) > SMALLEST_JUMP
 
 
-def _left_out(rows: ArcRows, short: list[int], end: int) -> Iterator[tuple[ArcRows, int, float]]:
+def without_one_of(
+    rows: ArcRows, short: list[int], end: int
+) -> Iterator[tuple[ArcRows, int, float]]:
     """The arcs without one of some that may end, cut there by an end; the row that is cut;
     and the square of the duration that is left out.
 
@@ -563,16 +565,13 @@ def _left_out(rows: ArcRows, short: list[int], end: int) -> Iterator[tuple[ArcRo
             yield shorter, row - 1 - 2 * sum(i < row for i in some), float(duration) ** 2
 
 
-def _turns(osc: Oscillator, motion: PeriodicMotion, of: Any) -> Iterator[tuple]:
-    """Where guards of the arcs of a motion have a minimum inside: the row, the time since its
-    entry, the state (x1, x2, t), and the value there.
-
-    of: those wanted, of the guards of an arc in their order.
-    """
+def minima_of_guards(osc: Oscillator, motion: PeriodicMotion, some: slice) -> Iterator[tuple]:
+    """Where some guards of the arcs of a motion, in their order, have a minimum inside: the row,
+    the time since its entry, the state (x1, x2, t), and the value there."""
     found = guards_along(osc, motion.chain, motion.unknowns)
     states, value, slope = map(np.asarray, found)
     for row in np.flatnonzero(np.asarray(motion.chain.used)).tolist():
-        for values, slopes in zip(of(value[row].T), of(slope[row].T), strict=True):
+        for values, slopes in zip(value[row].T[some], slope[row].T[some], strict=True):
             times = states[row, :, 2]
             falls = (slopes[:-1] < 0) & (slopes[1:] > 0) & np.isfinite(values[:-1])
             for i in np.flatnonzero(falls & (np.diff(times) > 0)).tolist():

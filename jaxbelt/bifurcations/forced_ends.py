@@ -14,10 +14,12 @@ import numpy as np
 
 from ..cycles.clocked import turns_of
 from ..cycles.periodic import PeriodicMotion
+from ..model.oscillator import Oscillator
 from ..numerics.continuation import continue_curve
 from ..results import Status
 from .base import AbstractCondition, BifurcationPoint
 from .crossings import CrossingSliding
+from .edges import GrazingEdge
 from .forced import (
     AbstractForcedCondition,
     AddingSliding,
@@ -26,6 +28,7 @@ from .forced import (
     UnitCircle,
     motion_between_halves,
 )
+from .forced_edges import edged_belts
 from .special import FAR, SpecialPoint, Trail, is_elsewhere
 from .tangencies import GrazingSliding
 from .timed_systems import place_of_motion
@@ -37,10 +40,11 @@ REACH = 3
 POINTS_TO_A_SIDE = 5
 
 
-def borders_of(belts: int) -> list[AbstractCondition]:
-    """The conditions on which signatures of motions end, for so many belts."""
+def borders_of(osc: Oscillator) -> list[AbstractCondition]:
+    """The conditions on which signatures of an oscillator's motions end."""
     kinds = GrazingSliding, CrossingSliding, SwitchingSliding, AddingSliding
-    return [kind(belt) for kind in kinds for belt in range(belts)]
+    sliding = [kind(belt) for kind in kinds for belt in range(len(osc.belts))]
+    return [*sliding, *(GrazingEdge(belt) for belt in edged_belts(osc))]
 
 
 def meeting_point(condition: AbstractCondition, trail: Trail) -> SpecialPoint | None:
@@ -52,7 +56,7 @@ def meeting_point(condition: AbstractCondition, trail: Trail) -> SpecialPoint | 
     motion = trail.system.motion(osc, trail.x)
     found = []
     if isinstance(condition, UnitCircle):
-        for border in borders_of(len(osc.belts)):
+        for border in borders_of(osc):
             kind = type(condition).__name__
             for point in _zeros_along(trail, border.with_clock(), motion, kind):
                 named = point._replace(kind=type(border).__name__, belts=border.belts_concerned)

@@ -1,0 +1,120 @@
+"""Periodic motions of forced oscillators that touch a contact edge.
+
+Where a belt of constant friction is fast, the mass never comes to its velocity, and below the edge
+the motion is linear: the force at which it touches is known in closed form.
+"""
+
+import numpy as np
+import pytest
+
+import jaxbelt as jb
+
+DAMPING, FRICTION, EDGE = 0.4, 0.6, 1.5
+
+
+def osc(force, frequency=0.7, way=1.0, unit=1.0, phase=0.0, edge=EDGE):
+    law = jb.Coulomb(FRICTION, FRICTION)
+    belt = jb.Belt(3.0 * way * unit, law, upper=edge * unit, load=unit)
+    return jb.Oscillator(DAMPING, (belt,), forcing=jb.Harmonic(force * unit, frequency, phase))
+
+
+def touching_force(frequency, way=1.0, edge=EDGE):
+    """The force at which the motion below the edge touches it."""
+    response = np.abs(1 - frequency**2 + 1j * DAMPING * frequency)
+    return (edge - way * FRICTION) * response
+
+
+@pytest.mark.parametrize(("frequency", "way"), [(0.7, 1.0), (1.3, 1.0), (0.9, -1.0)])
+def test_a_motion_touches_the_edge_where_the_closed_form_says(frequency, way):
+    expected = touching_force(frequency, way)
+    point = jb.refine(
+        jb.GrazingEdge(0),
+        lambda force: osc(force, frequency, way),
+        at=0.95 * expected,
+        start=(way * FRICTION, 0.0),
+    )
+    assert float(point.value) == pytest.approx(expected, abs=1e-12)
+    assert float(point.cycle.x1_max) == pytest.approx(EDGE, abs=1e-11)
+
+
+def test_the_point_is_found_from_a_motion_that_goes_beyond_the_edge():
+    expected = touching_force(0.7)
+    beyond = jb.find_cycle(osc(1.0005 * expected), (0.7, 0.0))
+    assert [kind for kind, _ in beyond.signature] == [jb.EventKind.EDGE] * 2
+    point = jb.refine(jb.GrazingEdge(0), osc, at=1.0005 * expected, start=beyond)
+    assert float(point.value) == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("unit", "phase"), [(1e-3, 0.0), (1e3, 0.0), (1.0, 2.0), (1.0, -np.pi / 2)]
+)
+def test_units_and_the_phase_of_the_force_make_no_difference(unit, phase):
+    expected = touching_force(0.7)
+
+    def other(force):
+        return osc(force, unit=unit, phase=phase)
+
+    point = jb.refine(jb.GrazingEdge(0), other, at=0.95 * expected, start=(0.6 * unit, 0.0))
+    assert float(point.value) == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.slow
+def test_an_edge_at_which_one_belt_ends_and_another_begins_is_one_of_both():
+    def two(force):
+        law = jb.Coulomb(FRICTION, FRICTION)
+        belts = jb.Belt(3.0, law, upper=EDGE), jb.Belt(4.0, law, load=0.3, lower=EDGE)
+        return jb.Oscillator(DAMPING, belts, forcing=jb.Harmonic(force, 0.7))
+
+    expected = touching_force(0.7)
+    for belt in (0, 1):
+        point = jb.refine(jb.GrazingEdge(belt), two, at=0.95 * expected, start=(0.6, 0.0))
+        assert float(point.value) == pytest.approx(expected, abs=1e-12)
+
+
+def test_only_conditions_that_forced_oscillators_have_are_taken():
+    with pytest.raises(ValueError, match="condition must be stable, as osc is forced"):
+        jb.refine(jb.GrazingEdge(0, unstable=True), osc, at=0.5)
+    with pytest.raises(ValueError, match="belt must be one with a finite edge, got 0"):
+        jb.refine(jb.GrazingEdge(0), lambda force: osc(force, edge=np.inf), at=0.5)
+
+
+def resonant(force, edge=1.0):
+    belt = jb.Belt(3.0, jb.Conti(1.0, 0.6, 2.0), upper=edge)
+    return jb.Oscillator(0.1, (belt,), forcing=jb.Harmonic(force, 1.3))
+
+
+@pytest.mark.slow
+def test_a_branch_goes_through_the_point_and_back_to_its_fold():
+    found = jb.bifurcation_diagram(
+        resonant, span=(0.12, 0.48), start=jb.find_cycle(resonant(0.13), (0.0, 0.0))
+    )
+    grazing, fold = sorted(found.points, key=lambda point: -float(point.value))
+    assert isinstance(grazing.condition, jb.GrazingEdge)
+    assert isinstance(fold.condition, jb.Fold)
+    touched = jb.find_cycle(resonant(float(grazing.value), edge=50.0), (0.0, 0.0))
+    assert float(touched.x1_max) == pytest.approx(1.0, abs=1e-11)
+    # By brute force: one motion, then two, then only the one that goes far beyond the edge.
+    starts = [(x1, x2) for x1 in np.linspace(-1.5, 2, 6) for x2 in (-1.0, 0.0, 1.0)]
+    at_fold, at_edge = float(fold.value), float(grazing.value)
+    values = at_fold - 1e-5, at_fold + 1e-5, at_edge - 2e-5, at_edge + 2e-5
+    tops = [
+        {round(float(jb.find_cycle(resonant(force), start).x1_max), 4) for start in starts}
+        for force in values
+    ]
+    below, above, before, behind = (sorted(one) for one in tops)
+    assert len(below) == 1
+    assert below[0] < 1
+    assert len(above) == 2
+    assert above[0] < 1 < above[1]
+    assert len(behind) == len(before) == 1
+    assert behind[0] > 1.2
+
+
+@pytest.mark.slow
+def test_a_curve_of_touching_motions_is_the_response_without_the_edge():
+    point = jb.refine(jb.GrazingEdge(0), resonant, at=0.23)
+    curve = jb.bifurcation_curve(point, resonant, ((0.05, 0.6), (0.7, 1.4)))
+    assert len(curve.values) > 40
+    for force, edge in np.asarray(curve.values)[::15]:
+        free = jb.find_cycle(resonant(force, edge=50.0), (0.0, 0.0))
+        assert float(free.x1_max) == pytest.approx(edge, abs=1e-11)
