@@ -211,11 +211,13 @@ class GrazingEdge(AbstractEdgeTouch):
     """The cycle is tangent to a contact edge of a belt: an extremum of x1 touches it.
 
     Beyond, the cycle passes the edge; or there is none, where the edge pushes away to both sides. A
-    cycle that passes the edge ends there, too, with the velocity zero on it.
+    cycle that passes the edge ends there, too, with the velocity zero on it. With forcing it is a
+    periodic motion that touches.
 
     Args:
         belt: Number of the belt.
-        unstable: Whether the cycle is the one from `unstable_cycle`, not an attracting one.
+        unstable: Whether the cycle is the one from `unstable_cycle`, not an attracting one; not
+            with forcing, where motions of any stability touch.
     """
 
     unstable: bool = eqx.field(static=True, default=False)

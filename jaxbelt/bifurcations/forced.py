@@ -12,8 +12,8 @@ unknown, the parameter:
 - `AddingSliding`: inside a stick phase the force that is needed touches the limit.
 
 M. di Bernardo, P. Kowalczyk, A. Nordmark, Int. J. Bifurcation Chaos 13 (2003) 2935, have the four
-sliding bifurcations. What touches begins as an arc that is cut there, or from an arc beyond that is
-left out.
+sliding bifurcations; contact edges are in `forced_edges`. What touches begins as an arc that is cut
+there, or from an arc beyond that is left out.
 """
 
 from collections.abc import Iterator, Sequence
