@@ -158,6 +158,11 @@ class Harmonic:
 
 
 @dataclass(frozen=True)
+class BaseMotion(Harmonic):
+    """A support that moves by amplitude cos(frequency t + phase)."""
+
+
+@dataclass(frozen=True)
 class Belt:
     """velocity, load: numbers or `Oscillating`. law: as of `engine.Belt`, or ("cubic", a0, a1, a3),
     mu(r) = a0 - a1 r + a3 r^3, or ("polynomial", c0, c1, c2, c3)."""
@@ -209,8 +214,12 @@ class Oscillator:
         """
         groups, rows = {}, []
         for f in self.forces:
-            row = _numbers(Oscillating(0.0, f.amplitude, f.frequency, f.phase))
-            groups.setdefault(row[2], []).append(row)
+            waves = [f]
+            if isinstance(f, BaseMotion):
+                waves = base_motion(self.damping, f.amplitude, f.frequency, f.phase)
+            for one in waves:
+                row = _numbers(Oscillating(0.0, one.amplitude, one.frequency, one.phase))
+                groups.setdefault(row[2], []).append(row)
         for frequency, some in groups.items():
             if len(some) == 1:
                 rows += some

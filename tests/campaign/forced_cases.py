@@ -35,7 +35,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from . import compare, forced
-from .forced import Belt, Harmonic, Oscillating, Oscillator
+from .forced import BaseMotion, Belt, Harmonic, Oscillating, Oscillator
 
 __all__ = [
     "GOOD",
@@ -69,13 +69,20 @@ LAWS = ("conti", "coulomb", "stribeck", "cubic")
 @dataclass(frozen=True)
 class Structure:
     """What decides the compiled program: laws of the belts, whether there are edges, the number of
-    harmonic forces, and which velocities and loads oscillate."""
+    forces, which velocities and loads oscillate, and how many forces, the last ones, are those of a
+    support that moves."""
 
     laws: tuple
     edges: bool
     forces: int
     velocities: tuple
     loads: tuple
+    supports: int = 0
+
+    @property
+    def kinds(self):
+        """The classes of the forces."""
+        return [Harmonic] * (self.forces - self.supports) + [BaseMotion] * self.supports
 
 
 @dataclass(frozen=True)
@@ -97,6 +104,7 @@ class Case:
             len(self.oscillator.forces),
             tuple(isinstance(b.velocity, Oscillating) for b in belts),
             tuple(isinstance(b.load, Oscillating) for b in belts),
+            sum(isinstance(f, BaseMotion) for f in self.oscillator.forces),
         )
 
     @property
@@ -128,6 +136,7 @@ class Case:
             omega=osc.omega,
             belts=belts,
             forces=[list(vars(f).values()) for f in osc.forces],
+            supports=self.structure.supports,
             y0=list(self.y0),
             t0=self.t0,
             T=self.T,
@@ -152,35 +161,40 @@ def from_json(text):
         )
         for b in d["belts"]
     )
-    osc = Oscillator(d["damping"], belts, tuple(Harmonic(*f) for f in d["forces"]), d["omega"])
+    first = len(d["forces"]) - d.get("supports", 0)
+    forces = tuple((Harmonic, BaseMotion)[i >= first](*f) for i, f in enumerate(d["forces"]))
+    osc = Oscillator(d["damping"], belts, forces, d["omega"])
     return Case(osc, tuple(d["y0"]), d["T"], d["kind"], d["t0"])
 
 
 def structures(rng, programs):
     """Some structures, the commonest first."""
 
-    def of(laws, edges, forces, velocities=(), loads=()):
+    def of(laws, edges, forces, velocities=(), loads=(), supports=0):
         flags = [tuple(i in chosen for i in range(len(laws))) for chosen in (velocities, loads)]
-        return Structure(tuple(laws), edges, forces, *flags)
+        return Structure(tuple(laws), edges, forces, *flags, supports)
 
     first = [
         of(["coulomb"], False, 1),
         of(["cubic"], False, 1),
         of(["conti", "conti"], True, 1),
-        of(["coulomb", "coulomb"], True, 2, velocities=[0]),
+        of(["coulomb", "coulomb"], True, 2, velocities=[0], supports=1),
         of(["stribeck"], False, 2, loads=[0]),
         of(["conti"], True, 1, velocities=[0]),
         of(["coulomb", "stribeck", "conti"], True, 2, velocities=[1], loads=[0]),
         of(["cubic", "coulomb"], False, 0, velocities=[0, 1]),
         of(["coulomb"], True, 0, velocities=[0], loads=[0]),
-        of(["stribeck", "stribeck", "cubic"], True, 1),
+        of(["stribeck", "stribeck", "cubic"], True, 1, supports=1),
+        of(["coulomb"], False, 1, supports=1),
+        of(["conti"], True, 2, supports=2),
     ]
     while len(first) < programs:
         n = int(rng.choice([1, 1, 2, 2, 3]))
         laws = [str(law) for law in rng.choice(LAWS, size=n)]
         moving, loaded = ([i for i in range(n) if rng.random() < 0.35] for _ in range(2))
         forces = int(rng.integers(0 if moving or loaded else 1, 3))
-        s = of(laws, bool(rng.random() < 0.6), forces, moving, loaded)
+        supports = int(rng.integers(forces + 1)) if rng.random() < 0.5 else 0
+        s = of(laws, bool(rng.random() < 0.6), forces, moving, loaded, supports)
         if s not in first:
             first.append(s)
     return first[:programs]
@@ -254,9 +268,7 @@ def random_case(rng, structure, T=60.0):
         if swells:
             load = Oscillating(load, load * rng.uniform(0.1, 1.0), frequency(), phase())
         belts.append(Belt(velocity, _random_law(rng, law), load, *cut))
-    forces = tuple(
-        Harmonic(rng.uniform(0.05, 1.5), frequency(), phase()) for _ in range(structure.forces)
-    )
+    forces = tuple(kind(rng.uniform(0.05, 1.5), frequency(), phase()) for kind in structure.kinds)
     omega = rng.uniform(0.6, 1.6) if rng.random() < 0.3 else 1.0
     osc = Oscillator(rng.uniform(0.02, 0.8), tuple(belts), forces, omega)
     t0 = rng.uniform(-5.0, 5.0) if rng.random() < 0.3 else 0.0
@@ -311,8 +323,8 @@ def round_case(rng, structure, T=60.0):
         belts.append(Belt(v, laws[law], u, *cut))
     capacity = load * laws[structure.laws[0]][1]
     forces = tuple(
-        Harmonic(capacity * float(rng.choice([1.0, 1.0, 0.5, 2.0])), frequency(), phase())
-        for _ in range(structure.forces)
+        kind(capacity * float(rng.choice([1.0, 1.0, 0.5, 2.0])), frequency(), phase())
+        for kind in structure.kinds
     )
     damping = float(rng.choice([0.5, 0.25, 0.1, 0.05, 1.0, 0.2]))
     osc = Oscillator(damping, tuple(belts), forces, float(rng.choice([1, 1, 1, 1, 0.5, 2])))
@@ -583,7 +595,7 @@ def moved(case, direction, by=1.0):
             # The static limit does not come below the kinetic friction.
             law = ("coulomb", law[1], law[1])
         belts.append(Belt(velocity, law, load, next(rest), next(rest)))
-    forces = tuple(Harmonic(next(rest), next(rest), next(rest)) for _ in case.oscillator.forces)
+    forces = tuple(kind(next(rest), next(rest), next(rest)) for kind in case.structure.kinds)
     return replace(case, oscillator=Oscillator(damping, tuple(belts), forces, omega), y0=y0)
 
 

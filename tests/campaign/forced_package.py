@@ -11,6 +11,7 @@ import jaxbelt as jb
 from . import forced, forced_cases
 from .package import MANY_SEGMENTS, Final
 
+FORCES = {forced.Harmonic: jb.Harmonic, forced.BaseMotion: jb.BaseMotion}
 LAWS = {
     "conti": jb.Conti,
     "coulomb": jb.Coulomb,
@@ -29,7 +30,7 @@ def oscillator(osc):
         jb.Belt(_wave(b.velocity), LAWS[b.law[0]](*b.law[1:]), _wave(b.load), b.lower, b.upper)
         for b in osc.belts
     )
-    forces = tuple(jb.Harmonic(f.amplitude, f.frequency, f.phase) for f in osc.forces)
+    forces = tuple(FORCES[type(f)](f.amplitude, f.frequency, f.phase) for f in osc.forces)
     return jb.Oscillator(osc.damping, belts, osc.omega, forcing=forces)
 
 
@@ -85,7 +86,7 @@ def _of_numbers(structure, sizes, values, rest):
         friction = LAWS[law](static, *(next(rest) for _ in range(size)))
         edges = next(values), next(values)
         belts.append(jb.Belt(velocity, friction, load, *(edges if structure.edges else ())))
-    forces = tuple(jb.Harmonic(*(next(values) for _ in range(3))) for _ in range(structure.forces))
+    forces = tuple(FORCES[kind](*(next(values) for _ in range(3))) for kind in structure.kinds)
     return y0, jb.Oscillator(damping, tuple(belts), omega, forcing=forces)
 
 

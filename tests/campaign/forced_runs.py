@@ -10,7 +10,7 @@ from .outcome import Outcome
 from .runs import said as said
 
 #: Runs in one case, and structures, each a compilation.
-BATCH, PROGRAMS = 128, 12
+BATCH, PROGRAMS = 128, 14
 #: Runs that are differentiated in the last case of each structure, along one direction each.
 DIFFERENTIATED = 64
 #: Derivatives of the engine that its own differences know to this fraction.

@@ -21,7 +21,7 @@ from .package import Final
 from .runs import said as said
 
 #: Runs in one call, and structures, each a compilation.
-BATCH, PROGRAMS = 1024, 12
+BATCH, PROGRAMS = 1024, 14
 _SIZES = {"conti": 4, "coulomb": 2, "stribeck": 3, "cubic": 3}
 
 
@@ -83,7 +83,9 @@ def _from_numbers(structure, row):
         friction = forced_package.LAWS[law](*(next(values) for _ in range(_SIZES[law])))
         edges = (next(values), next(values)) if structure.edges else ()
         belts.append(jb.Belt(velocity, friction, load, *edges))
-    forces = tuple(jb.Harmonic(*(next(values) for _ in range(3))) for _ in range(structure.forces))
+    forces = tuple(
+        forced_package.FORCES[kind](*(next(values) for _ in range(3))) for kind in structure.kinds
+    )
     return jb.Oscillator(damping, tuple(belts), omega, forcing=forces)
 
 
