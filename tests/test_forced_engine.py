@@ -51,6 +51,15 @@ def wave(w):
     )
 
 
+def push(force, t, damping):
+    """What pushes the mass: a force, or spring and dashpot of a support that moves."""
+    angle = force.frequency * t + force.phase
+    place = force.amplitude * np.cos(angle)
+    if not isinstance(force, forced.BaseMotion):
+        return place
+    return place + damping * -force.frequency * force.amplitude * np.sin(angle)
+
+
 class Peer:
     """A run by `solve_ivp`: stick phases are integrated, too, and end where the needed force, asked
     of the right-hand side, exceeds the capacity. A step may hide what is shorter."""
@@ -76,7 +85,7 @@ class Peer:
     def pull(self, t, y):
         """x2' by all but a belt that the mass is stuck to."""
         total = -y[0] - self.osc.damping * y[1]
-        total += sum(f.amplitude * np.cos(f.frequency * t + f.phase) for f in self.osc.forces)
+        total += sum(push(f, t, self.osc.damping) for f in self.osc.forces)
         for i, m in enumerate(self.mode):
             if abs(m) == 1:
                 r = m * (self.nu[i](t) - self.osc.omega * y[1])
@@ -398,7 +407,7 @@ def sampled_stick_phase(rng):
     ways = (velocity[1:] + 4 * middle + velocity[:-1]) / 6 * np.diff(t) / osc.omega
     x1 = case.y0[0] + np.concatenate([[0.0], np.cumsum(ways)])
     needed = slope[k](t) / osc.omega + x1 + osc.damping * velocity / osc.omega
-    needed -= sum(f.amplitude * np.cos(f.frequency * t + f.phase) for f in osc.forces)
+    needed -= sum(push(f, t, osc.damping) for f in osc.forces)
     capacity, distances = 0.0, {}
     for i, (b, m) in enumerate(zip(belts, start.mode_end)):
         load = wave(b.load)[0](t)
