@@ -6,6 +6,8 @@ the motion is linear: the force at which it touches is known in closed form.
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import fsolve
 
 import jaxbelt as jb
 
@@ -118,3 +120,72 @@ def test_a_curve_of_touching_motions_is_the_response_without_the_edge():
     for force, edge in np.asarray(curve.values)[::15]:
         free = jb.find_cycle(resonant(force, edge=50.0), (0.0, 0.0))
         assert float(free.x1_max) == pytest.approx(edge, abs=1e-11)
+
+
+# --- corners --------------------------------------------------------------------------------------
+
+AMPLITUDE, OMEGA, BELT, STATIC, KINETIC, OTHER = 0.5, 0.8, 0.5, 1.0, 0.8, 0.3
+
+
+def cornered(edge):
+    """Belt 0 carries the mass over the edge at which belt 1 begins to pull it back."""
+    other = jb.Belt(-1.0, jb.Coulomb(OTHER, OTHER), lower=edge)
+    belts = jb.Belt(BELT, jb.Coulomb(STATIC, KINETIC)), other
+    return jb.Oscillator(0.1, belts, forcing=jb.Harmonic(AMPLITUDE, OMEGA))
+
+
+def corner(pull, guess):
+    """The edge on which the mass slips off belt 0, whether the other belt pulls already (its
+    friction) or not yet (0), and the time when it does: by SciPy."""
+
+    def equations(unknowns):
+        slips, edge = unknowns
+
+        def rates(pull):
+            def of(t, y):
+                force = KINETIC - pull + AMPLITUDE * np.cos(OMEGA * t)
+                return [y[1], force - y[0] - 0.1 * y[1]]
+
+            return of
+
+        def back(t, y):
+            return y[0] - edge if t > slips + 0.1 else 1.0
+
+        def sticks(t, y):
+            return y[1] - BELT
+
+        back.terminal = sticks.terminal = True
+        back.direction, sticks.direction = -1, 1
+        options = dict(method="DOP853", rtol=1e-12, atol=1e-12)
+        until = slips + 2 * np.pi / OMEGA
+        over = solve_ivp(rates(OTHER), (slips, until), [edge, BELT], events=back, **options)
+        since, state = over.t[-1], over.y[:, -1]
+        rest = solve_ivp(rates(0.0), (since, until), state, events=sticks, **options)
+        needed = edge + 0.1 * BELT + pull - AMPLITUDE * np.cos(OMEGA * slips)
+        return needed - STATIC, rest.y[0, -1] + BELT * (until - rest.t[-1]) - edge
+
+    return fsolve(equations, guess, xtol=1e-13)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("pull", "guess"), [(OTHER, (0.7, 1.1)), (0.0, (0.7, 1.3))])
+def test_a_mass_slips_off_its_belt_at_the_edge_of_another_one(pull, guess):
+    _, expected = corner(pull, guess)
+    for side in (-0.01, 0.01):
+        point = jb.refine(jb.CornerCollision(1), cornered, at=expected + side, start=(0.0, 0.0))
+        assert float(point.value) == pytest.approx(expected, abs=1e-10)
+
+
+@pytest.mark.slow
+def test_a_branch_passes_corners_by_name():
+    start = jb.find_cycle(cornered(0.9), (0.0, 0.0))
+    found = jb.bifurcation_diagram(cornered, span=(0.5, 1.4), start=start)
+    assert found.open_ends == ()
+    kinds = [type(point.condition) for point in found.points]
+    assert kinds == [jb.CornerCollision] * 3
+    for point in found.points:
+        sides = (
+            jb.find_cycle(cornered(float(point.value) + way), point.cycle.start).signature
+            for way in (-1e-5, 1e-5)
+        )
+        assert len(set(sides)) == 2

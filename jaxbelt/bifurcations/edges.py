@@ -37,7 +37,7 @@ from .base import Line
 from .conditions import AbstractCycleCondition
 from .crossings import arrival_tests
 from .edge_rests import check_edge, slow_focus_limit
-from .forced_edges import TimedEdgeGrazing
+from .forced_edges import TimedCorner, TimedEdgeGrazing
 from .guesses import nearest, without_arcs
 from .rests import hopf_limit
 from .systems import CycleSystem, nearest_edge
@@ -258,7 +258,8 @@ class CornerCollision(AbstractEdgeTouch):
 
     It begins, or ceases, to stick to a belt there, or crosses its boundary: beyond, these come in
     another order, or another event comes instead; or, like at a nonsmooth fold, there is no cycle.
-    A guess has to lie on a side where there is a cycle; `scan` tries both.
+    A guess has to lie on a side where there is a cycle; `scan` tries both. With forcing it is a
+    periodic motion, and goes on.
 
     Args:
         belt: Number of the belt.
@@ -270,6 +271,9 @@ class CornerCollision(AbstractEdgeTouch):
     @property
     def wanted(self):
         return -1.0
+
+    def with_clock(self):
+        return TimedCorner(int(self.belt), type(self))
 
     def limit(self, trail):
         """The point where the cycle shrinks to a pseudo-focus with the velocity of the

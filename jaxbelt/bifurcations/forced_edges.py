@@ -1,9 +1,12 @@
-"""`GrazingEdge` of forced oscillators: a periodic motion that touches a contact edge.
+"""Contact edges and periodic motions of forced oscillators: `GrazingEdge`, `CornerCollision`.
 
-The arc that touches is cut where x2 = 0, and one more equation has x1 on the edge there. Beyond the
-edge, where its belt comes or goes, a motion has one more arc, which lasts for the square root of
-the distance: it is left out.
+An arc ends in two events at once, in one of which it ends anyway; the guard of the other one is the
+condition. A motion that touches an edge is cut where x2 = 0, and x1 is on the edge there. Beyond
+the edge, where its belt comes or goes, it has one more arc, which lasts for the square root of the
+distance: that is left out. In a corner an edge and a boundary, or slip onset, come together.
 """
+
+from collections.abc import Iterator
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,7 +14,8 @@ import numpy as np
 from jaxtyping import Array
 
 from ..cycles.clocked import TimedChain
-from ..model.modes import edge_at, edges
+from ..cycles.shooting import end_guard
+from ..model.modes import STUCK, edges
 from ..model.oscillator import Oscillator
 from ..motion.arcs import Ends
 from .base import AbstractCondition
@@ -19,19 +23,20 @@ from .forced import AbstractForcedCondition, ArcRows, Beginning, minima_of_guard
 from .timed_systems import TimedSystem
 
 
-class OnEdge(TimedSystem):
-    """x1 is on the edge of that number at the end of the arc `row`, at which x2 = 0."""
+class TwoEvents(TimedSystem):
+    """The guard of `end` vanishes in the mode of `codes` where the arc `row` ends."""
 
     chain: TimedChain
     row: Array
-    edge: Array
+    codes: Array
+    end: Array
 
     def condition(self, osc, z):
-        return z[self.row + 1, 0] - edge_at(osc, self.edge)
+        return end_guard(osc, self.codes, self.end, z[self.row + 1, :3])
 
 
-class TimedEdgeGrazing(AbstractForcedCondition):
-    """`GrazingEdge` with a clock; public: that class."""
+class AbstractTimedEdge(AbstractForcedCondition):
+    """A condition on an edge with a clock; public: its class without one."""
 
     belt: int
     public: type[AbstractCondition] = eqx.field(static=True)
@@ -39,29 +44,76 @@ class TimedEdgeGrazing(AbstractForcedCondition):
     def kind_along(self, osc, multiplier) -> type[AbstractCondition]:
         return self.public
 
+    def ends_of_edges(self, osc: Oscillator) -> Iterator[tuple[int, np.ndarray]]:
+        """Of each edge of the belt, of a known oscillator, its number in `Ends`, and those of all
+        edges at the same place."""
+        n, places = len(osc.belts), _places(osc)
+        for edge in (self.belt, n + self.belt):
+            if np.isfinite(places[edge]):
+                yield n + edge, n + np.flatnonzero(places == places[edge])
+
+
+def _both(
+    rows: ArcRows, distance: float, row: int, end: int, codes: np.ndarray | None = None
+) -> Beginning:
+    """The arc of a row is to end in another event as well, in its own mode or that of the codes."""
+    codes = rows.codes[row] if codes is None else codes
+    numbers = [jnp.asarray(one) for one in (row, codes, end)]
+    return Beginning(rows, distance, lambda chain: TwoEvents(chain, *numbers))
+
+
+class TimedEdgeGrazing(AbstractTimedEdge):
+    """`GrazingEdge` with a clock."""
+
     def beginnings_of(self, osc, motion, known=False):
-        rows, n = ArcRows.of(motion), len(osc.belts)
-        names, places = Ends(n), np.array([float(place) for place in edges(osc)])
-        own = [edge for edge in (self.belt, n + self.belt) if np.isfinite(places[edge])]
-
-        def system(row, edge):
-            return lambda chain: OnEdge(chain, jnp.asarray(row), jnp.asarray(edge))
-
-        if known:
-            row = int(np.flatnonzero(rows.ends == names.extremum_x1)[0])
-            edge = min(own, key=lambda edge: abs(places[edge] - rows.z[row + 1, 0]))
-            yield Beginning(rows, 0.0, system(row, edge))
-            return
-        for edge in own:
-            # Edges of other belts may be at the same place.
-            same = n + np.flatnonzero(places == places[edge])
+        rows, names = ArcRows.of(motion), Ends(len(osc.belts))
+        for edge, same in self.ends_of_edges(osc):
+            if known:
+                for row in np.flatnonzero(rows.ends == names.extremum_x1).tolist():
+                    yield _both(rows, _from_edge(osc, rows, row, edge), row, edge)
+                continue
             short = [r for r in range(1, len(rows.ends) - 1) if _is_excursion(rows, r, same)]
             for shorter, row, value in without_one_of(rows, short, names.extremum_x1):
-                yield Beginning(shorter, value, system(row, edge))
-            own_guard = slice(n + edge, n + edge + 1)
+                yield _both(shorter, value, row, edge)
+            own_guard = slice(edge, edge + 1)
             for row, since, state, value in minima_of_guards(osc, motion, own_guard):
                 cut = rows.cut(row, since, state, names.extremum_x1)
-                yield Beginning(cut, value, system(row, edge))
+                yield _both(cut, value, row, edge)
+
+
+class TimedCorner(AbstractTimedEdge):
+    """`CornerCollision` with a clock."""
+
+    def beginnings_of(self, osc, motion, known=False):
+        rows, n = ArcRows.of(motion), len(osc.belts)
+        onset = Ends(n).onset
+        for edge, same in self.ends_of_edges(osc):
+            for row, end in enumerate(rows.ends[:-1].tolist()):
+                if end < n or end == onset:
+                    yield _both(rows, _from_edge(osc, rows, row, edge), row, edge)
+                elif end in same:
+                    y = jnp.asarray(rows.z[row + 1, :3])
+                    before, after = rows.codes[row : row + 2]
+                    for codes, other in self._others_on_edge(before, after, onset):
+                        guard = end_guard(osc, jnp.asarray(codes), jnp.asarray(other), y)
+                        yield _both(rows, abs(float(guard)), row, other, codes)
+
+    def _others_on_edge(
+        self, before: np.ndarray, after: np.ndarray, onset: int
+    ) -> Iterator[tuple[np.ndarray, int]]:
+        """Other events of an arc that ends on an edge: in the modes of which codes, and their
+        numbers."""
+        if np.any(before == STUCK):
+            held = np.where((before == STUCK) & (np.abs(after) < 2), STUCK, after)
+            yield from ((codes, onset) for codes in (before, held) if np.any(codes == STUCK))
+        else:
+            touched = (np.abs(before) < 2) | (np.abs(after) < 2)
+            yield from ((before, belt) for belt in np.flatnonzero(touched).tolist())
+
+
+def _from_edge(osc: Oscillator, rows: ArcRows, row: int, end: int) -> float:
+    """How far from an edge an arc ends."""
+    return abs(_places(osc)[end - len(osc.belts)] - rows.z[row + 1, 0])
 
 
 def _is_excursion(rows: ArcRows, row: int, ends: np.ndarray) -> bool:
@@ -70,8 +122,10 @@ def _is_excursion(rows: ArcRows, row: int, ends: np.ndarray) -> bool:
     return bool(passes and np.array_equal(rows.codes[row - 1], rows.codes[row + 1]))
 
 
+def _places(osc: Oscillator) -> np.ndarray:
+    return np.array([float(place) for place in edges(osc)])
+
+
 def edged_belts(osc: Oscillator) -> list[int]:
     """The numbers of the belts that have a contact edge, of a known oscillator."""
-    n = len(osc.belts)
-    places = np.array([float(place) for place in edges(osc)]).reshape(2, n)
-    return np.flatnonzero(np.any(np.isfinite(places), axis=0)).tolist()
+    return np.flatnonzero(np.any(np.isfinite(_places(osc).reshape(2, -1)), axis=0)).tolist()

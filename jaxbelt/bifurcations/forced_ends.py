@@ -19,7 +19,7 @@ from ..numerics.continuation import continue_curve
 from ..results import Status
 from .base import AbstractCondition, BifurcationPoint
 from .crossings import CrossingSliding
-from .edges import GrazingEdge
+from .edges import CornerCollision, GrazingEdge
 from .forced import (
     AbstractForcedCondition,
     AddingSliding,
@@ -44,7 +44,8 @@ def borders_of(osc: Oscillator) -> list[AbstractCondition]:
     """The conditions on which signatures of an oscillator's motions end."""
     kinds = GrazingSliding, CrossingSliding, SwitchingSliding, AddingSliding
     sliding = [kind(belt) for kind in kinds for belt in range(len(osc.belts))]
-    return [*sliding, *(GrazingEdge(belt) for belt in edged_belts(osc))]
+    of_edges = [kind(belt) for kind in (GrazingEdge, CornerCollision) for belt in edged_belts(osc)]
+    return [*sliding, *of_edges]
 
 
 def meeting_point(condition: AbstractCondition, trail: Trail) -> SpecialPoint | None:

@@ -71,8 +71,8 @@ def refine(
 
     For forced oscillators the conditions are those on a periodic motion: `PeriodDoubling()`,
     `Fold()`, `Torus()`, `GrazingSliding(belt)`, `CrossingSliding(belt)`, `SwitchingSliding(belt)`,
-    `AddingSliding(belt)` and `GrazingEdge(belt)`. The nearest point is taken; not under `jax.vmap`
-    and `jax.jit`.
+    `AddingSliding(belt)`, `GrazingEdge(belt)` and `CornerCollision(belt)`. The nearest point is
+    taken; not under `jax.vmap` and `jax.jit`.
 
     Args:
         condition: `Hopf()`, `NonsmoothFold(belt)`, `GrazingSliding(belt)`,
