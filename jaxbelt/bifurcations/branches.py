@@ -249,7 +249,7 @@ def _side_of_point(
     rows, points = [row], []
     while len(rows) < MOST_MOTIONS:
         note_progress(f"{len(rows)} motions on one side")
-        ahead, found, further = _branch_leg(line, rows[-1], sign, row)
+        ahead, found, further = _branch_leg(line, rows, sign)
         rows += ahead
         points += found
         if rows[-1] is row and len(rows) > 1:
@@ -264,15 +264,17 @@ def _side_of_point(
 
 
 def _branch_leg(
-    line: ForcedLine, row: MotionRow, sign: float, home: MotionRow
+    line: ForcedLine, behind: list[MotionRow], sign: float
 ) -> tuple[list[MotionRow], list[BifurcationPoint], tuple[MotionRow, float] | float | None]:
-    """The motions after a row with its signature, the points on the way, and how it goes on.
+    """The motions after the last one behind with its signature, the points on the way, and how it
+    goes on.
 
     Where the signature ends that is the first motion with another one, and the sense in which the
     parameter goes from it. It is None where the branch leaves the span, or ends in a point (also
     where it comes back to the branch that it has left in a period doubling), or has come back to
-    the motion at home, which is then its last row; and a value where it ends otherwise.
+    the first motion behind, which is then its last row; and a value where it ends otherwise.
     """
+    home, row = behind[0], behind[-1]
     leg, begun = MotionLeg.begun(line, row)
     if not begun.found:
         return [], [], row.value
@@ -306,11 +308,8 @@ def _branch_leg(
             point = _border(line, borders, last, new.value, start)
             if point is not None:
                 between = _points_between(line, last, MotionRow(float(point.value), point.cycle))
-                return (
-                    rows,
-                    [*points, *between, point],
-                    _beyond_point(line, last, point, tangent[-1]),
-                )
+                further = _beyond_point(line, [*behind, *rows], point, tangent[-1])
+                return rows, [*points, *between, point], further
             step, straight = 0.5 * step, 0
             continue
         points += list(_points_between(line, last, new))
@@ -331,7 +330,8 @@ def _branch_leg(
         point = _border(line, near, last, value, start)
         if point is not None:
             between = _points_between(line, last, MotionRow(float(point.value), point.cycle))
-            return rows, [*points, *between, point], _beyond_point(line, last, point, tangent[-1])
+            further = _beyond_point(line, [*behind, *rows], point, tangent[-1])
+            return rows, [*points, *between, point], further
         further = _past_corner(line, last, value, start)
         if further is not None:
             return rows, points, (further, float(np.sign(value - last.value)))
@@ -480,12 +480,14 @@ def _border(
 
 
 def _beyond_point(
-    line: ForcedLine, last: MotionRow, point: BifurcationPoint, direction: float
+    line: ForcedLine, rows: list[MotionRow], point: BifurcationPoint, direction: float
 ) -> tuple[MotionRow, float] | None:
-    """A motion beyond the point in which a signature ended, and the sense in which to go on;
-    direction: the sign is that in which the parameter went."""
+    """A motion beyond the point in which the signature of the last row ended, which is on no part
+    of the branch so far, and the sense in which to go on; direction: the sign is that in which the
+    parameter went."""
     if _jumps_at(point):
         return None
+    last = rows[-1]
     direction, value = float(np.sign(direction)), float(point.value)
     periods, start = last.motion.periods, np.asarray(point.cycle.start)
     # Between a guess and the next phase 0 its error may grow a thousandfold.
@@ -497,7 +499,7 @@ def _beyond_point(
         there = value + side * direction * part * line.length
         if line.first <= there <= line.last:
             osc = line.at(there)
-            own = last.motion.at(osc) if side < 0 else None
+            passed = [row.motion.at(osc) for row in _rows_beside(rows, there)]
             for stretch in (0.0, part, -part):
                 guess = at + stretch * (at - before)
                 motion = periodic_from(osc, guess, periods, line.turns, share)
@@ -507,10 +509,17 @@ def _beyond_point(
                 row = MotionRow(there, motion)
                 # Beyond the point the signature that has ended may still solve, by rounding.
                 ended = of_one_loop(motion.signature) == of_one_loop(last.motion.signature)
-                same = ended if own is None else is_same_motion(own, motion)
-                if not same and MotionLeg.begun(line, row)[1].found:
+                same = any(is_same_motion(one, motion) for one in passed)
+                if not (same or (side > 0 and ended)) and MotionLeg.begun(line, row)[1].found:
                     return row, side * direction
     return None
+
+
+def _rows_beside(rows: list[MotionRow], value: float) -> list[MotionRow]:
+    """The last row, and both rows wherever the branch has passed a value."""
+    pairs = itertools.pairwise(rows)
+    beside = [pair for pair in pairs if (pair[0].value - value) * (pair[1].value - value) <= 0]
+    return [rows[-1], *(row for pair in beside for row in pair)]
 
 
 def _jumps_at(point: BifurcationPoint) -> bool:
