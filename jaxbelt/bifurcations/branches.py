@@ -42,6 +42,7 @@ from .forced import (
     AddingSliding,
     Fold,
     PeriodDoubling,
+    SwitchingSliding,
     Torus,
     friction_jumps,
     motion_between_halves,
@@ -523,11 +524,11 @@ def _rows_beside(rows: list[MotionRow], value: float) -> list[MotionRow]:
 
 
 def _jumps_at(point: BifurcationPoint) -> bool:
-    """Whether a motion only touches there, and friction jumps: to one side of the point the belt
-    holds, or lets go, for a time that is not short. So the branch ends."""
+    """Whether friction jumps there so that to one side of the point the belt holds, or lets go, for
+    a time that is not short. So the branch ends."""
     condition = point.condition
-    touches = isinstance(condition, AddingSliding | GrazingSliding)
-    return touches and friction_jumps(point.oscillator, int(condition.belt))
+    may_jump = isinstance(condition, AddingSliding | GrazingSliding | SwitchingSliding)
+    return may_jump and friction_jumps(point.oscillator, int(condition.belt))
 
 
 def _other_branch(

@@ -58,7 +58,7 @@ from .systems import solve_system
 from .timed_systems import AtLimit, OnUnitCircle, TimedSystem, Touching, place_of_motion
 
 #: Places of a motion from which a condition is tried, the most promising ones first.
-TRIED = 3
+TRIED = 4
 #: Minima of guards earlier than this part of an arc are those at which it began.
 AT_ONSET = 1e-6
 #: Arcs whose durations differ by a smaller part may be images of one another.
@@ -437,18 +437,18 @@ class _AtArrival(AbstractForcedCondition):
             changed = (before != after) & (np.abs(after) < 2)
             held = jnp.asarray(np.where(changed, STUCK, after))
             distance, rises = _excess(osc, held, jnp.asarray(rows.z[row + 1, :3]))
-            fits = known or float(rises) * self.rises > 0 or abs(float(distance)) > 0.1
-            there = rows
+            if not (known or float(rises) * self.rises > 0 or abs(float(distance)) > 0.1):
+                continue
+            yield Beginning(rows, abs(float(distance)), system(row, held))
             returns = row + 2 < len(rows.ends) and rows.ends[row + 1] == k
             if returns and after[k] == -before[k] and rows.codes[row + 2, k] == STUCK:
-                # It crosses, comes back soon, and sticks: the excursion is left out.
+                # It crosses, comes back, and sticks: maybe soon, and the excursion is to vanish.
                 gone, phase = rows.z[row + 1], rows.z[row + 2]
                 longer = np.append(gone[:3], phase[3] + gone[3])
                 there = rows.put(
                     row + 1, row + 2, (rows.codes[row + 2], rows.ends[row + 2], longer)
                 )
-            if fits:
-                yield Beginning(there, abs(float(distance)), system(row, held))
+                yield Beginning(there, max(abs(float(distance)), gone[3]), system(row, held))
 
 
 @jit
@@ -481,7 +481,9 @@ class SwitchingSliding(_AtArrival):
     """A motion arrives at the boundary of a belt where it could just begin to stick.
 
     The force that is needed to stick falls there: to one side of the point the mass sticks at once,
-    to the other it crosses the boundary, comes back soon, and sticks then.
+    to the other it crosses the boundary, comes back soon, and sticks then. Where the belt's static
+    friction is above its kinetic friction it does not come back soon: the motion ends at the point,
+    on whichever side it is.
 
     Args:
         belt: Number of the belt.
