@@ -470,6 +470,10 @@ def number(value: Any) -> str:
 class Parameters(KnownNames):
     """A record of parameters with rules, whose text constructs it again."""
 
+    def __init_subclass__(cls, **options: Any):
+        super().__init_subclass__(**options)
+        _refuse_overrides(cls)
+
     def rules(self) -> list[Rule]:
         """Conditions on the parameters."""
         return []
@@ -485,3 +489,26 @@ class Parameters(KnownNames):
             for name, value in vars(self).items()
         )
         return f"{type(self).__name__}({values})"
+
+
+def _refuse_overrides(kind: type) -> None:
+    """Raises a `TypeError` for a user's class that changes what one of this package's does, which
+    programs know by its formula."""
+    ours = [one for one in kind.__mro__ if is_of_this_package(one)]
+    if kind in ours:
+        return
+    named = [one for one in ours if issubclass(one, Parameters) and one.__name__[0] != "_"]
+    ready = [one for one in named if one is not Parameters and not inspect.isabstract(one)]
+    known = {name for one in ours for name in vars(one)} - {"rules"}
+    changed = [name for name in vars(kind) if name in known and not name.startswith("_")]
+    if ready and changed:
+        roots = [f"subclass jb.{one.__name__}" for one in ours if inspect.isabstract(one)]
+        raise TypeError(
+            f"{kind.__name__}.{changed[0]} must not replace that of {ready[0].__name__}, whose "
+            f"formula is built in: {roots[-1] if roots else 'there is no way to have another one'}"
+        )
+
+
+def is_of_this_package(kind: type) -> bool:
+    """Whether a class is one of jaxbelt's."""
+    return kind.__module__.partition(".")[0] == __name__.partition(".")[0]

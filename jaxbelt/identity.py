@@ -40,8 +40,19 @@ from jax.core import Tracer
 REPR_TYPES = (type(None), bool, int, float, complex, str, bytes, type(...), type(NotImplemented))
 #: Builtins that read what the code does not name.
 READS_ANYTHING = ("eval", "exec", "globals", "open", "input", "__import__")
-#: Attributes of a class that do not affect what it does.
-BOOKKEEPING = ("_abc_impl", "__doc__", "__module__", "__dict__", "__weakref__")
+#: Attributes of Python's modules that lead to any other module.
+ALL_MODULES = (("sys", "modules"), ("importlib", "import_module"))
+#: Attributes that name or describe a function, a class or an object, and do not affect what it
+#: does.
+BOOKKEEPING = frozenset(
+    (
+        *("__module__", "__name__", "__qualname__", "__doc__", "__dict__", "__weakref__"),
+        *("__annotations__", "__annotate__", "__annotate_func__", "__annotations_cache__"),
+        *("__type_params__", "__parameters__", "__orig_bases__", "__static_attributes__"),
+        *("__firstlineno__", "__match_args__", "__signature__", "__slots__"),
+        *("__dataclass_fields__", "__dataclass_params__", "__abstractmethods__", "_abc_impl"),
+    )
+)
 
 
 class FingerprintError(ValueError):
@@ -193,7 +204,7 @@ class _Reading:
         yield self.digest(function.__code__, f"{place}: ")
         yield self.digest(function.__defaults__, f"defaults of {place}: ")
         yield self.digest(function.__kwdefaults__, f"defaults of {place}: ")
-        attributes = {k: v for k, v in vars(function).items() if not _is_special(k)}
+        attributes = {k: v for k, v in vars(function).items() if k not in BOOKKEEPING}
         yield self.digest(attributes, f"attributes of {place}: ")
         cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
         names = {name: _content(cell) for name, cell in cells}
@@ -225,6 +236,10 @@ class _Reading:
             else:
                 continue
             following = iter(instructions[i + 1 :])
+            if isinstance(value, ModuleType) and i + 1 < len(instructions):
+                asked = value.__name__, instructions[i + 1].argval
+                if asked in ALL_MODULES:
+                    self.refuse(place, f"{'.'.join(asked)}, which may read anything")
             while isinstance(value, ModuleType) and _package_of(value.__name__) is None:
                 attribute = next(following, one)
                 if attribute.opname not in ("LOAD_ATTR", "LOAD_METHOD"):
@@ -243,8 +258,7 @@ class _Reading:
         yield self.digest(type(kind), f"{place}: ")
         yield from (self.digest(base, f"{place}: ") for base in kind.__bases__)
         for name, value in vars(kind).items():
-            is_definition = isinstance(value, FunctionType | staticmethod | classmethod | property)
-            if name not in BOOKKEEPING and (is_definition or not _is_special(name)):
+            if name not in BOOKKEEPING:
                 yield from (name, self.digest(value, f"{place}.{name}: "))
 
     def of_object(self, value: Any, place: str) -> Iterator[str]:
@@ -284,10 +298,6 @@ def _digest_of(*parts: str) -> str:
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
 
 
-def _is_special(name: str) -> bool:
-    return name.startswith("__") and name.endswith("__")
-
-
 def _as_pickled(value: Any) -> Any:
     return value.__reduce_ex__(4)
 
@@ -300,7 +310,7 @@ def _content(cell: Any) -> Any:
 
 
 def _without_caches(kind: type, state: Any) -> Any:
-    """State of an object without what was computed from the rest of it, or copied to it."""
+    """State of an object without what was computed from the rest of it, or describes it."""
     if isinstance(state, tuple) and len(state) == 2 and isinstance(state[1], dict):
         return tuple(_without_caches(kind, part) for part in state)  # attributes, and slots
     if not isinstance(state, dict):
@@ -308,8 +318,7 @@ def _without_caches(kind: type, state: Any) -> Any:
     cached = functools.cached_property
 
     def is_state(name):
-        special = isinstance(name, str) and _is_special(name)
-        return not special and not isinstance(getattr(kind, str(name), None), cached)
+        return name not in BOOKKEEPING and not isinstance(getattr(kind, str(name), None), cached)
 
     return {name: value for name, value in state.items() if is_state(name)}
 

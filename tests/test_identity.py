@@ -94,6 +94,30 @@ class Law(jb.AbstractFriction):
         return self.static * calls(speed)
 
 
+class Plane(eqx.Module):
+    height: float
+
+    def at(self, x1, x2):
+        return x1 - self.height
+
+
+class Wrapper:
+    def __init__(self, function):
+        functools.update_wrapper(self, function)
+
+    def __call__(self, x):
+        return vars(self)["__wrapped__"](x)
+
+
+def with_call(decorate, factor):
+    class Calls:
+        @decorate
+        def __call__(self, x):
+            return factor * x
+
+    return Calls()
+
+
 class Colour(enum.Enum):
     RED = 1
 
@@ -193,6 +217,13 @@ VALUES = {
     "namespaces": (types.SimpleNamespace(a=1), types.SimpleNamespace(a=2)),
     "laws": (jb.Conti(1.0, 0.6, 10.0), jb.Coulomb(1.0, 0.6)),
     "packages": (np, jnp),
+    "methods": (Counts(1.0).update, Counts(2.0).update),
+    "methods of modules": (Plane(1.0).at, Plane(2.0).at),
+    "wrappers": (Wrapper(lambda x: x), Wrapper(lambda x: -x)),
+    "calls": (with_call(lambda f: f, 1), with_call(lambda f: f, 2)),
+    "calls by JAX": (with_call(jax.jit, 1), with_call(jax.jit, 2)),
+    "calls by Equinox": (with_call(eqx.filter_jit, 1), with_call(eqx.filter_jit, 2)),
+    "calls that are kept": (with_call(functools.cache, 1), with_call(functools.cache, 2)),
 }
 
 
@@ -254,6 +285,7 @@ UNTOLD = {
     "lock": (lambda: types.SimpleNamespace(lock=LOCK), "SimpleNamespace: lock: .* a lock"),
     "evaluated": (lambda: lambda: eval("1"), "eval, which may read anything"),
     "all globals": (lambda: lambda: globals()["LIMIT"], "globals, which may read anything"),
+    "all modules": (lambda: lambda: sys.modules["own"].C, "sys.modules, which may read anything"),
     "file": (lambda: lambda: open("a.txt"), "open, which may read anything"),
     "module": (lambda: closes_over(sys.modules[__name__]), "the module value as a value"),
     "module in an object": (

@@ -380,6 +380,56 @@ def test_what_a_function_reads_belongs_to_the_question(reader, tmp_path, monkeyp
     assert sweep("a").equals(first) and sweep().equals(first)
 
 
+def test_which_parameters_vary_belongs_to_the_question(tmp_path):
+    law = jb.Conti(1.0, 0.6, 10.0)
+    axes, store = {"p": np.linspace(0.3, 0.6, 4)}, tmp_path / "of_damping.zarr"
+
+    def of_damping(p):
+        return jb.Oscillator(p, (jb.Belt(0.3, law),))
+
+    def of_velocity(p):
+        return jb.Oscillator(0.3, (jb.Belt(p, law),))
+
+    jb.sweep(of_damping, axes, y0=(1.0, 0.0), t1=20.0, store=store)
+    with pytest.raises(ValueError, match="which differs in make"):
+        jb.sweep(of_velocity, axes, y0=(1.0, 0.0), t1=20.0, store=store)
+
+
+def test_a_table_counts_to_its_last_digit(tmp_path):
+    def with_table(last):
+        law = jb.Tabulated((0.0, 0.5, 1.0), (1.0, 0.7, last))
+        return lambda p: jb.Oscillator(p, (jb.Belt(0.3, law),))
+
+    axes, store = {"p": np.linspace(0.3, 0.6, 4)}, tmp_path / "table.zarr"
+    jb.sweep(with_table(0.6), axes, y0=(1.0, 0.0), t1=20.0, store=store)
+    with pytest.raises(ValueError, match="which differs in the law of belt 0"):
+        jb.sweep(with_table(0.6 + 1e-14), axes, y0=(1.0, 0.0), t1=20.0, store=store)
+
+
+@pytest.mark.parametrize("scaled", [False, True])
+def test_a_force_of_ones_own_counts_by_what_it_does(tmp_path, scaled):
+    def make_of(power):
+        class Push(jb.AbstractForce):
+            frequency: Any
+
+            def force(self, t):
+                return jnp.cos(self.frequency * t) ** power
+
+        def make(velocity):
+            law, push = jb.Conti(0.6, 0.35, 10.0), Push(jnp.asarray(15.0))
+            if scaled:
+                belt = jb.PhysicalBelt(velocity, law, 20.0)
+                return jb.Machine(1.2, 450.0, 0.6, (belt,), forcing=(push,)).oscillator
+            return jb.Oscillator(0.1, (jb.Belt(velocity, law),), forcing=(push,))
+
+        return make
+
+    axes, store = {"velocity": np.linspace(0.1, 0.3, 4)}, tmp_path / "force.zarr"
+    jb.sweep(make_of(1), axes, y0=(1.0, 0.0), t1=5.0, store=store)
+    with pytest.raises(ValueError, match="which differs in force 0"):
+        jb.sweep(make_of(3), axes, y0=(1.0, 0.0), t1=5.0, store=store)
+
+
 def test_what_cannot_be_told_is_refused_for_stores_only(tmp_path):
     observe = Slopes(threading.Lock())
 

@@ -4,9 +4,8 @@ import functools
 import hashlib
 import importlib.metadata
 import inspect
-import itertools
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +18,7 @@ from ..checks import (
     as_positive,
     as_tolerance,
     in_words,
+    is_of_this_package,
     require,
     require_one_of,
     require_usable_jax,
@@ -174,18 +174,14 @@ class Question:
         identity["axes"] = ", ".join(f"{name} ({axis.size})" for name, axis in grid.axes.items())
         identity["y0"] = repr(tuple(grid.y0.values()))
         identity["oscillator"] = ", ".join(parameters)
-        identity["make"] = _hash(" ".join(f"{x:.10e}" for x in rows.ravel().tolist()).encode())
+        varying = " ".join(str(number) for number, varies in enumerate(grid.mapped) if varies)
+        numbers = " ".join(f"{x:.10e}" for x in rows.ravel().tolist())
+        identity["make"] = _hash(f"{varying}: {numbers}".encode())
         for i, belt in enumerate(grid.example.belts):
-            shown = _plain(repr(belt.friction))
-            kinds = _kinds_in(belt.friction)
-            names = " with ".join(kind.__qualname__ for kind in kinds)
-            if not all(map(_is_ours, kinds)):
-                names = f"{names}, {fingerprint(belt.friction, f'the law of belt {i}')}"
-            identity[f"the law of belt {i}"] = f"{shown} of {names}"
+            shown, name = _plain(repr(belt.friction)), f"the law of belt {i}"
+            identity[name] = f"{shown} of {_kinds_of(belt.friction, name)}"
         for i, force in enumerate(grid.example.forcing):
-            kind = type(force)
-            own = "" if _is_ours(kind) else f", {fingerprint(force, f'force {i}')}"
-            identity[f"force {i}"] = kind.__qualname__ + own
+            identity[f"force {i}"] = _kinds_of(force, f"force {i}")
         identity |= {name: repr(value) for name, value in self.numbers.items()}
         identity["observe"] = repr(self.observe)
         if not isinstance(self.observe, str):
@@ -280,13 +276,32 @@ def _value(value: Any) -> str:
     return repr(float(value)) if np.ndim(value) == 0 and hasattr(value, "dtype") else repr(value)
 
 
-def _kinds_in(module: eqx.Module) -> list[type]:
-    """Class of a module, and those of the modules in it."""
+def _kinds_of(module: eqx.Module, name: str) -> str:
+    """Classes of a law or force and of what it is made of; with its static arguments where all of
+    them are this package's, else with its fingerprint; name: for messages."""
+    parts = [*_modules_in(module)]
+    kinds = [type(part) for part in parts]
+    names = " with ".join(kind.__qualname__ for kind in kinds)
+    if not all(map(is_of_this_package, kinds)):
+        return f"{names}, {fingerprint(module, name)}"
+    static = [
+        getattr(part, argument)
+        for part in parts
+        for argument in inspect.signature(type(part)).parameters
+        if isinstance(getattr(part, argument, None), tuple)
+    ]
+    return f"{names}, {_hash(repr(static).encode())}" if static else names
+
+
+def _modules_in(module: eqx.Module) -> Iterator[eqx.Module]:
+    """A module and those in it."""
+    yield module
     parts = jax.tree.leaves(
         list(vars(module).values()), is_leaf=lambda part: isinstance(part, eqx.Module)
     )
-    nested = (_kinds_in(part) for part in parts if isinstance(part, eqx.Module))
-    return [type(module), *itertools.chain.from_iterable(nested)]
+    for part in parts:
+        if isinstance(part, eqx.Module):
+            yield from _modules_in(part)
 
 
 def _plain(text: str) -> str:
@@ -296,7 +311,3 @@ def _plain(text: str) -> str:
 
 def _hash(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()[:16]
-
-
-def _is_ours(kind: type) -> bool:
-    return kind.__module__.partition(".")[0] == __name__.partition(".")[0]
