@@ -26,7 +26,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..checks import as_array, check_finite, is_concrete, require
+from ..checks import as_finite, is_concrete, require
 from ..cycles.chains import Loop, padded_loop
 from ..cycles.clocked import (
     guards_along,
@@ -289,8 +289,7 @@ def motions_to_begin_from(osc: OwnOscillator, start: Any, turns: int) -> Sequenc
     if isinstance(start, PeriodicMotion):
         return [rescaled(start, 1 / osc.units.length, lambda _: osc)]
     if start is not None:
-        start = as_array(start, "start", (2,))
-        check_finite(start, "start")
+        start = as_finite(start, "start", (2,))
         motion = attracted(osc, np.asarray(osc.units.into(start)), turns)
         found = [motion] if int(motion.status) == Status.OK else []
     else:

@@ -18,10 +18,10 @@ from jaxtyping import ArrayLike
 from ..activity import announced, note_progress
 from ..checks import (
     as_array,
+    as_finite,
     as_positive,
     as_whole,
     check_arguments,
-    check_finite,
     outside_of_traces,
     refuse_interval,
     require_one_of,
@@ -336,8 +336,7 @@ def _checked_starts(starts: Any) -> tuple[tuple[float, float], ...]:
         return ()
     shape = np.shape(starts) if isinstance(starts, tuple | list | np.ndarray) else ()
     require_value(len(shape) == 2 and shape[0] and shape[1] == 2, "starts", expected, starts)
-    rows = as_array(starts, "starts", (None, 2))
-    check_finite(rows, "starts")
+    rows = as_finite(starts, "starts", (None, 2))
     return tuple((float(x1), float(x2)) for x1, x2 in np.asarray(rows))
 
 

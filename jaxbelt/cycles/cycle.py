@@ -17,9 +17,8 @@ from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
 from ..checks import (
-    as_array,
+    as_finite,
     as_whole,
-    check_finite,
     is_concrete,
     number,
     pick,
@@ -443,8 +442,7 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
         ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(osc)
-    y0 = as_array(y0, "y0", (2,))
-    check_finite(y0, "y0")
+    y0 = as_finite(y0, "y0", (2,))
     if has_clock(osc):
         return motion_reached(osc, y0)
     room = None if max_arcs is None else as_whole(max_arcs, "max_arcs")

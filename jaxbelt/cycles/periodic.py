@@ -16,9 +16,8 @@ from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
 from ..checks import (
-    as_array,
+    as_finite,
     as_whole,
-    check_finite,
     is_concrete,
     number,
     require,
@@ -543,8 +542,7 @@ def periodic(osc: Oscillator, guess: ArrayLike | tuple, *, periods: int = 1) -> 
     """
     check_oscillator(osc)
     check_clock(osc, "periodic", "jb.find_cycle or jb.unstable_cycle")
-    guess = as_array(guess, "guess", (2,))
-    check_finite(guess, "guess")
+    guess = as_finite(guess, "guess", (2,))
     periods = as_whole(periods, "periods")
     require(periods <= PERIODS_AT_ONCE, "periods", f"at most {PERIODS_AT_ONCE}", periods)
     return _differentiable_motion(

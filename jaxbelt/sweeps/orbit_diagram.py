@@ -22,12 +22,11 @@ from jaxtyping import ArrayLike
 
 from ..activity import announced, note_progress
 from ..checks import (
-    as_array,
+    as_finite,
     as_interval,
     as_positive,
     as_tolerance,
     as_whole,
-    check_finite,
     outside_of_traces,
     require_one_of,
     require_value,
@@ -238,8 +237,7 @@ def _starts_of(y0: Any) -> np.ndarray:
         are_several = np.ndim(y0) == 2
     except ValueError:  # rows of different lengths; the check below raises
         are_several = False
-    starts = np.asarray(as_array(y0, "y0", (None, 2) if are_several else (2,)))
-    check_finite(starts, "y0")
+    starts = np.asarray(as_finite(y0, "y0", (None, 2) if are_several else (2,)))
     require_value(starts.size, "y0", "one start or more", y0)
     return starts.reshape(-1, 2)
 
