@@ -41,6 +41,7 @@ from .shooting import (
     ARC_STEPS,
     FINE,
     arc_by_arc,
+    arc_columns,
     arc_step,
     coarse_step,
     directions_of,
@@ -199,10 +200,6 @@ _timed_equations = _by_turns(_timed_arc_equations)
 _timed_equations_and_blocks = _by_turns(_and_columns)
 
 
-def _timed_rows(chain: TimedChain, z: Array) -> tuple[Array, ...]:
-    return chain.codes, chain.ends, chain.mesh, z
-
-
 def _timed_mismatch(out: Array, z: Array) -> Array:
     exits = out[:, :3] - jnp.roll(z[:, :3], -1, axis=0)
     return jnp.concatenate([exits, out[:, 3:4]], axis=1)
@@ -210,14 +207,14 @@ def _timed_mismatch(out: Array, z: Array) -> Array:
 
 def timed_residual(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
     """The 4N equations at the unknowns z, [N, 4]: mismatch of x1, x2, t, and the guard."""
-    rows = _timed_rows(chain, z)
+    rows = arc_columns(chain, z)
     return _timed_mismatch(_timed_equations(chain.turns)((osc, chain.share), rows), z)
 
 
 def timed_blocks(osc: Oscillator, along: Oscillator | None, chain: TimedChain, z: Array):
     """`timed_residual`, and its derivatives as `shooting.residual_and_blocks` has them."""
     given = osc, along, chain.share
-    out, blocks = _timed_equations_and_blocks(chain.turns)(given, _timed_rows(chain, z))
+    out, blocks = _timed_equations_and_blocks(chain.turns)(given, arc_columns(chain, z))
     return _timed_mismatch(out, z), blocks
 
 
@@ -265,7 +262,7 @@ def _maps_and_slopes(turns, osc, along, share, codes, end, mesh, unknown: Array)
 
 def arc_maps(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
     """`_arc_map` of all arcs, [N, 3, 3]."""
-    return _arc_maps(chain.turns)((osc, chain.share), _timed_rows(chain, z))
+    return _arc_maps(chain.turns)((osc, chain.share), arc_columns(chain, z))
 
 
 def _product(maps: Array) -> Array:
@@ -298,7 +295,7 @@ def monodromy_and_slopes(
 ) -> tuple[Array, Array, Array]:
     """`monodromy`, and its derivatives by z, [2, 2, N, 4], and along directions, [2, 2, k]."""
     given = osc, along, chain.share
-    maps, slopes = _maps_and_slopes(chain.turns)(given, _timed_rows(chain, z))
+    maps, slopes = _maps_and_slopes(chain.turns)(given, arc_columns(chain, z))
 
     def times(total, one):
         return one @ total, total
