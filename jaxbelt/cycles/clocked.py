@@ -309,11 +309,6 @@ def monodromy_and_slopes(
     return matrix[:2, :2], moved[..., :4], jnp.sum(moved[..., 4:], axis=2)
 
 
-def sticks_in(chain: Chain) -> Array:
-    """Whether a chain has a stick phase."""
-    return jnp.any(chain.used[:, None] & (chain.codes == 0))
-
-
 def multipliers_of(matrix: Array, sticks: Array) -> Array:
     """The eigenvalues of a monodromy matrix, complex, [2], the larger one first; of a motion that
     sticks the second is exactly 0, and the first the trace."""

@@ -213,7 +213,7 @@ def cycle_of(
     else:
         residual = error
     status = first_failure(status, admissible(osc, chain, z), Status.NOT_ADMISSIBLE)
-    sticks = jnp.any(chain.used[:, None] & (chain.codes == 0))
+    sticks = chain.sticks
     # An equilibrium solves the equations, too, with arcs of any duration.
     moves = sticks | (jnp.max(z[:, 1]) - jnp.min(z[:, 1]) > HOLDS)
     status = first_failure(status, moves, Status.NO_CONVERGENCE)

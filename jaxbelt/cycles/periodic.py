@@ -42,7 +42,6 @@ from .clocked import (
     monodromy,
     multipliers_of,
     states_at_phase,
-    sticks_in,
     timed_admissible,
     timed_chain,
     timed_residual,
@@ -323,7 +322,7 @@ def motion_at(osc, chain, z, residual, iterations, status) -> PeriodicMotion:
 
 def _motion(osc, chain, z, residual, iterations, status) -> PeriodicMotion:
     known = jnp.where(status == Status.OK, 1.0, jnp.nan)
-    found = multipliers_of(monodromy(osc, chain, z), sticks_in(chain))
+    found = multipliers_of(monodromy(osc, chain, z), chain.sticks)
     found, numbers = found * known.astype(complex), (residual * known, iterations, status)
     return PeriodicMotion(osc, chain, z * known, found, *numbers)
 

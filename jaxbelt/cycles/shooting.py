@@ -505,9 +505,8 @@ def solve_closed(osc: Oscillator, chain: Chain, guess: Array) -> tuple[Array, Ar
     start = _with_ends(backwards, guess)
     solved = solve(ClosedChain(chain, backwards), osc, start)
     z = _with_entries(osc, chain, backwards, solved.z)
-    sticks = jnp.any(chain.used[:, None] & (chain.codes == 0))
     off = jnp.maximum(solved.unsettled, jnp.max(solved.rounding.reshape(-1, 3)[:, :2]))
-    return z, solved.iterations, jnp.where(sticks, 0.0, off)
+    return z, solved.iterations, jnp.where(chain.sticks, 0.0, off)
 
 
 def closed(osc: Oscillator, chain: Chain, z: Array) -> Array:
