@@ -47,7 +47,6 @@ from ..cycles.unstable import among_all, from_starts
 from ..model.equilibria import EquilibriumKind, candidates
 from ..model.far_out import is_bounded
 from ..model.oscillator import Oscillator
-from ..model.parameters import leaf_index
 from ..model.variations import as_span, varied
 from ..motion.integrators import STRIDE
 from ..numerics.compiling import each, jit
@@ -82,24 +81,18 @@ class ParameterPath:
     ):
         #: Whether labels contain courses, which change basins only and nothing that attracts.
         self.basins = basins
-        # `where` first: where it is left out, the span stands in its place.
-        if isinstance(osc, Oscillator):
-            leaf_index(osc, where)
-        first, last = as_span(span, where)
+        first, last = as_span(osc, where, span)
         given = varied(osc, where, (first,))
         known = "of known numbers: paths are not for jit, vmap or derivatives"
         at_first = given.oscillator(np.array([first]))
         require(is_concrete(at_first), "osc", known, "a traced one")
         conditions = check_conditions(conditions)
-        for value in (first, last):
-            given.check(value)
+        #: In own units, the parameter too, like everything that follows.
+        self.variation = given.over(first, last)
         #: The given oscillator, or the one at the first value.
         self.osc = osc if isinstance(osc, Oscillator) else at_first
         for condition in conditions:
             condition.check(self.osc)
-        #: In own units, the parameter too, like everything that follows.
-        ends = np.array([[0.5 * (first + last)], [first], [last]])
-        self.variation = given.in_own_units(*ends)
         self._oscillators: dict[float, Oscillator] = {}
         self._idle: dict[float, np.ndarray] = {}
         measured = 1.0 if given.units is not None else float(self.variation.own.parameters[0])

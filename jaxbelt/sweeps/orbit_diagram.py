@@ -33,7 +33,6 @@ from ..checks import (
 )
 from ..cycles.attractors import RUN
 from ..model.oscillator import Oscillator, frequencies, has_clock
-from ..model.parameters import leaf_index
 from ..model.variations import Variation, as_span, varied
 from ..numerics.spacing import evenly_spaced
 from ..results import Status, draw
@@ -206,9 +205,7 @@ def orbit_diagram(
     Raises:
         ValueError: If an argument is impossible; the message names it.
     """
-    if isinstance(osc, Oscillator):
-        leaf_index(osc, where)
-    first, last = as_span(span, where)
+    first, last = as_span(osc, where, span)
     starts = _starts_of(y0)
     numbers = {"rtol": as_positive(rtol, "rtol"), "atol": as_tolerance(atol, "atol")}
     variation = varied(osc, where, (first,), forced=True)
