@@ -53,7 +53,7 @@ from ..model.variations import Variation
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from ..results import Status
-from .base import AbstractCondition, BifurcationPoint, Line, point_of
+from .base import AbstractCondition, BifurcationPoint, Line, point_of, point_without_cycle
 from .systems import solve_system
 from .timed_systems import AtLimit, OnUnitCircle, TimedSystem, Touching, place_of_motion
 
@@ -266,21 +266,11 @@ def forced_point(
         return replace(nearest, condition=condition)
     if found:
         return replace(found[0], condition=condition)
+    nan, none = jnp.asarray(jnp.nan), jnp.asarray(Status.NOT_TOUCHED.value)
+    family, steps = variation.family(value), jnp.full(1, jnp.nan)
+    point = point_without_cycle(family, value, steps, nan, nan, none, none)
     nothing = nothing_found(own, turns, Status.NOT_TOUCHED)
-    nan = jnp.asarray(jnp.nan)
-    return BifurcationPoint(
-        condition=condition,
-        value=nan,
-        residual=nan,
-        iterations=jnp.asarray(0),
-        steps=jnp.full(1, jnp.nan),
-        error=nan,
-        multiplier=nan,
-        x1=nan,
-        oscillator=own,
-        cycle=nothing,
-        status=jnp.asarray(Status.NOT_TOUCHED.value),
-    )
+    return replace(point, condition=condition, oscillator=own, cycle=nothing)
 
 
 def motions_to_begin_from(osc: OwnOscillator, start: Any, turns: int) -> Sequence[PeriodicMotion]:
