@@ -39,8 +39,9 @@ from ..cycles.attractors import (
     sticks,
     without_idle,
 )
+from ..cycles.backwards import solved
 from ..cycles.chains import SIZES, Loop, cut
-from ..cycles.cycle import Cycle, as_loop, cycle_from, exactly, polish
+from ..cycles.cycle import Cycle, as_loop, cycle_from, polish
 from ..cycles.orbits import FINE_STRIDE
 from ..cycles.settling import AT_REST
 from ..cycles.unstable import among_all, from_starts
@@ -480,8 +481,7 @@ def _is_found(cycle: Cycle) -> bool:
 
 def _gone_on(osc: Oscillator, beside: Cycle) -> Cycle | None:
     """The cycle that an unstable cycle at a neighbouring value continues to."""
-    loop = jax.tree.map(np.asarray, as_loop(beside, ROOM))
-    cycle = exactly(osc, cut([loop])[0], jnp.asarray(Status.OK.value))
+    cycle = solved(osc, jax.tree.map(np.asarray, as_loop(beside, ROOM)))
     return cycle if _is_beside(beside, cycle) and float(cycle.multiplier) > 1 else None
 
 
