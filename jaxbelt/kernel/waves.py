@@ -195,14 +195,10 @@ class StepClock(NamedTuple):
             return x1 + ways[0] / self.osc.omega, speeds[0] / self.osc.omega
         rows = [jnp.broadcast_to(x, x1.shape) for x in (*ways, *speeds)]
         n, zero = len(ways), jnp.zeros_like(x1)
-        way, speed = (
-            foremost(self.osc_at_rest(), mode.stuck, x, zero) for x in (rows[:n], rows[n:])
-        )
+        # In the middle of the step: what does not depend on the time.
+        osc = self.at(0.5)
+        way, speed = (foremost(osc, mode.stuck, x, zero) for x in (rows[:n], rows[n:]))
         return x1 + way / self.osc.omega, speed / self.osc.omega
-
-    def osc_at_rest(self) -> Oscillator:
-        """The oscillator in the middle of the step, for what does not depend on the time."""
-        return self.at(0.5)
 
 
 def _belt(belt: Belt, velocity: Any, load: Any, c: float) -> Belt:
