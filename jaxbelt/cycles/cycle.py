@@ -87,25 +87,9 @@ class Cycle(ClosedMotion):
         """Duration of one loop, in dimensionless time tau."""
         return jnp.sum(self.unknowns[..., 2], axis=-1)
 
-    @property
-    def x1_min(self) -> Array:
-        """Smallest displacement."""
-        return jnp.min(self.unknowns[..., 0], axis=-1)
-
-    @property
-    def x1_max(self) -> Array:
-        """Largest displacement."""
-        return jnp.max(self.unknowns[..., 0], axis=-1)
-
-    @property
-    def x2_min(self) -> Array:
-        """Smallest velocity."""
-        return jnp.min(self.unknowns[..., 1], axis=-1)
-
-    @property
-    def x2_max(self) -> Array:
-        """Largest velocity."""
-        return jnp.max(self.unknowns[..., 1], axis=-1)
+    def _extremum(self, number):
+        column = self.unknowns[..., number // 2]
+        return (jnp.max if number % 2 else jnp.min)(column, axis=-1)
 
     @property
     def stable(self) -> Array:

@@ -147,25 +147,8 @@ class PeriodicMotion(ClosedMotion):
         cuts = np.flatnonzero(np.asarray(self.chain.ends) == self._ends.period)
         return self.unknowns[jnp.asarray(np.append(0, cuts[:-1] + 1)), :2]
 
-    @property
-    def x1_min(self) -> Array:
-        """Smallest displacement."""
-        return extrema_of(self)[..., 0]
-
-    @property
-    def x1_max(self) -> Array:
-        """Largest displacement."""
-        return extrema_of(self)[..., 1]
-
-    @property
-    def x2_min(self) -> Array:
-        """Smallest velocity."""
-        return extrema_of(self)[..., 2]
-
-    @property
-    def x2_max(self) -> Array:
-        """Largest velocity."""
-        return extrema_of(self)[..., 3]
+    def _extremum(self, number):
+        return extrema_of(self)[..., number]
 
     @property
     def stable(self) -> Array:
