@@ -30,8 +30,7 @@ from ..checks import as_finite, is_concrete, require
 from ..cycles.chains import Loop, padded_loop
 from ..cycles.clocked import (
     guards_along,
-    least_steps,
-    timed_chain,
+    timed_chain_of,
     turns_of,
 )
 from ..cycles.periodic import (
@@ -190,9 +189,8 @@ class AbstractForcedCondition(AbstractCondition):
         return None if nearest is None else replace(nearest, condition=self)
 
     def prepared(self, osc, guess):
-        loop = guess.rows.loop()
-        size, share = least_steps(osc, loop), guess.rows.share
-        chain, z = _chain_of_motion(osc, loop, size, turns_of(osc), share)
+        rows = guess.rows
+        chain, z = timed_chain_of(osc, rows.loop(), turns_of(osc), rows.share)
         system = guess.system(chain)
         return _refined(osc, system, z), z, jnp.asarray(Status.OK.value)
 
@@ -210,9 +208,6 @@ class AbstractForcedCondition(AbstractCondition):
 
     def place(self, point):
         return place_of_motion(point.cycle)
-
-
-_chain_of_motion = jit(timed_chain)
 
 
 @jit

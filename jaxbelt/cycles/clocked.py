@@ -154,6 +154,16 @@ def timed_chain(
     return lax.stop_gradient((chain, z))
 
 
+_compiled_chain = jit(timed_chain)
+
+
+def timed_chain_of(
+    osc: Oscillator, loop: Loop, turns: int, share: Array | None = None
+) -> tuple[TimedChain, Array]:
+    """`timed_chain` of a known loop, with as many steps as its arcs need."""
+    return _compiled_chain(osc, loop, least_steps(osc, loop), turns, share)
+
+
 # --- equations ------------------------------------------------------------------------------------
 
 

@@ -38,12 +38,11 @@ from .clocked import (
     TimedClosed,
     extrema_along,
     forcing_period,
-    least_steps,
     monodromy,
     multipliers_of,
     states_at_phase,
     timed_admissible,
-    timed_chain,
+    timed_chain_of,
     timed_residual,
     turns_of,
 )
@@ -318,15 +317,12 @@ def _motion_with_derivatives(osc: Oscillator, motion: PeriodicMotion) -> Periodi
     return _motion(osc, chain, z, motion.residual, motion.iterations, status)
 
 
-_timed_chain_of = jit(timed_chain)
-
-
 def solved_from(
     osc: Oscillator, loop: Loop, turns: int, share: Array | None = None
 ) -> PeriodicMotion:
     """The motion that a loop nearly is, with as many steps of integration as it takes; share: see
     `TimedChain`."""
-    chain, guess = _timed_chain_of(osc, loop, least_steps(osc, loop), turns, share)
+    chain, guess = timed_chain_of(osc, loop, turns, share)
     motion, error = _polished_motion(osc, chain, guess)
     for _ in range(MESH_HALVINGS):
         converged = int(motion.status) in (Status.OK, Status.NOT_ADMISSIBLE)
@@ -476,7 +472,7 @@ def _period_step(
     """How far the state where periods begin is from that of a periodic motion, by Newton's method
     along the orbit as it was followed."""
     loop = followed.loop()
-    chain, z = _timed_chain_of(osc, loop, least_steps(osc, loop), turns, begins)
+    chain, z = timed_chain_of(osc, loop, turns, begins)
     matrix = np.asarray(_monodromy_of(osc, chain, z))
     miss = followed.starts[-1] - followed.starts[0]
     if not np.all(np.isfinite(matrix)):
