@@ -31,7 +31,6 @@ from ..model.instants import carried, guards_at, guards_trend, trend_of
 from ..model.modes import capacity, mode_acceleration, mode_of, select, stick_velocity
 from ..model.oscillator import Oscillator, at_time, frequencies
 from ..motion.arcs import Ends
-from ..motion.integrators import density
 from ..numerics.compiling import any_lane, jit, power_of_two
 from ..numerics.implicit import Equations, step_to_root
 from ..numerics.newton import HOLDS
@@ -44,6 +43,7 @@ from .shooting import (
     arc_columns,
     arc_step,
     coarse_step,
+    densities,
     directions_of,
     end_guard,
     flow,
@@ -124,17 +124,8 @@ def _counted_ends(osc: Oscillator, codes: Array, entries: Array, durations: Arra
 def timed_mesh(osc: Oscillator, size: int, codes: Array, y: Array, duration: Array) -> Array:
     """Steps as fractions of the duration of a slip arc, [size]: as many as it needs, and zeros."""
     n = PLACING * size
-
-    def march():
-        def advance(y, _):
-            return coarse_step(osc, codes, y, duration / n)
-
-        return lax.scan(advance, y, None, length=n)[1]
-
     slips = ~mode_of(codes).any_stuck & (duration > 0)
-    rest = lax.cond(any_lane(slips), march, lambda: jnp.ones(n))
-    rho = jnp.concatenate([density(osc, mode_of(codes), y[0], y[1], y[2])[None], rest])
-    rho = jnp.clip(jnp.nan_to_num(rho, nan=1.0), 1.0, 100.0)
+    rho = densities(osc, n, codes, y, duration, slips)
     share = jnp.concatenate([jnp.zeros(1), jnp.cumsum(0.5 * (rho[1:] + rho[:-1]))])
     count = jnp.clip(jnp.ceil(duration * share[-1] / n / TIMED_STRIDE), 1, size)
     places = jnp.minimum(jnp.arange(size + 1.0) / count, 1.0)

@@ -122,6 +122,22 @@ def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) 
     if steps > EVEN_STEPS:
         return _marched_mesh(osc, steps, codes, y, duration)
     n = 24
+    # Stick phases, and the padding of a chain, take no steps.
+    rho = densities(osc, n, codes, y, duration, duration != 0)
+    share = jnp.concatenate([jnp.zeros(1), jnp.cumsum(rho[1:] + rho[:-1])])
+    grid = jnp.interp(
+        jnp.linspace(0.0, 1.0, steps + 1), share / share[-1], jnp.linspace(0, 1, n + 1)
+    )
+    return jnp.diff(grid)
+
+
+def densities(
+    osc: Oscillator, n: int, codes: Array, y: Array, duration: Array, slips: Array
+) -> Array:
+    """The density of steps at the ends of n coarse steps along an arc that slips, [n + 1].
+
+    Clipped: where a guess is poor the mesh is only less good.
+    """
 
     def march():
         def advance(y, _):
@@ -129,16 +145,9 @@ def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) 
 
         return lax.scan(advance, y, None, length=n)[1]
 
-    # Stick phases, and the padding of a chain, take no steps.
-    rest = lax.cond(any_lane(duration != 0), march, lambda: jnp.ones(n))
+    rest = lax.cond(any_lane(slips), march, lambda: jnp.ones(n))
     rho = jnp.concatenate([density(osc, mode_of(codes), *y)[None], rest])
-    # Clipped: where a guess is poor the mesh is only less good.
-    rho = jnp.clip(jnp.nan_to_num(rho, nan=1.0), 1.0, 100.0)
-    share = jnp.concatenate([jnp.zeros(1), jnp.cumsum(rho[1:] + rho[:-1])])
-    grid = jnp.interp(
-        jnp.linspace(0.0, 1.0, steps + 1), share / share[-1], jnp.linspace(0, 1, n + 1)
-    )
-    return jnp.diff(grid)
+    return jnp.clip(jnp.nan_to_num(rho, nan=1.0), 1.0, 100.0)
 
 
 def _marched_mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) -> Array:
