@@ -356,18 +356,22 @@ def states_along(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration:
 
     A stick arc is cut into steps of one length.
     """
-    stuck = mode_of(codes).any_stuck
-    fractions = jnp.where(stuck, jnp.full_like(mesh, 1 / mesh.size), mesh)
+    fractions = jnp.where(mode_of(codes).any_stuck, jnp.full_like(mesh, 1 / mesh.size), mesh)
 
     def advance(state, fraction):
-        h = duration * fraction
-        slipped = arc_step(functools.partial(slip_slopes, osc, codes), state, h, FINE)
-        held = jnp.stack(carried(osc, mode_of(codes), (state[0], state[1], state[2]), h))
-        new = jnp.where(stuck, held, slipped)
+        new = _after(osc, codes, state, duration * fraction)
         return new, new
 
     _, states = lax.scan(advance, y, fractions)
     return jnp.concatenate([y[None], states])
+
+
+def _after(osc: Oscillator, codes: Array, y: Array, h: Array) -> Array:
+    """The state of an arc a time h after y."""
+    mode = mode_of(codes)
+    slipped = arc_step(functools.partial(slip_slopes, osc, codes), y, h, FINE)
+    held = jnp.stack(carried(osc, mode, (y[0], y[1], y[2]), h))
+    return jnp.where(mode.any_stuck, held, slipped)
 
 
 @jit
@@ -463,9 +467,7 @@ def _least(
     h = states[step + 1, 2] - before[2]
 
     def state(s):
-        slipped = arc_step(functools.partial(slip_slopes, osc, codes), before, s * h, FINE)
-        held = jnp.stack(carried(osc, mode, (before[0], before[1], before[2]), s * h))
-        return jnp.where(mode.any_stuck, held, slipped)
+        return _after(osc, codes, before, s * h)
 
     def function(y):
         return jnp.dot(weight, jnp.stack(y[:2]))
