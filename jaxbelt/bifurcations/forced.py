@@ -192,7 +192,7 @@ class AbstractForcedCondition(AbstractCondition):
         rows = guess.rows
         chain, z = timed_chain_of(osc, rows.loop(), turns_of(osc), rows.share)
         system = guess.system(chain)
-        return _refined(osc, system, z), z, jnp.asarray(Status.OK.value)
+        return _refined(system, osc, z), z, jnp.asarray(Status.OK.value)
 
     def point_near(self, family, system, x, p, status):
         return _solved_timed_point(family, system, x, p, status)
@@ -210,9 +210,7 @@ class AbstractForcedCondition(AbstractCondition):
         return place_of_motion(point.cycle)
 
 
-@jit
-def _refined(osc: Oscillator, system: TimedSystem, x: Array) -> TimedSystem:
-    return system.refined(osc, x)
+_refined = jit(TimedSystem.refined)
 
 
 @jit
