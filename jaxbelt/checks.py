@@ -308,6 +308,13 @@ def as_array(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Arra
         return jnp.asarray(numbers, dtype=jnp.float64)
 
 
+def as_finite(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Array:
+    """`as_array` of finite numbers, as far as they are known."""
+    array = as_array(value, field, shape)
+    check_finite(array, field)
+    return array
+
+
 def scalar(field: str) -> Callable[[Any], Array]:
     """Converter of a field that is a number, see `as_array`."""
     return lambda value: as_array(value, field)

@@ -17,8 +17,9 @@ from jaxtyping import Array
 
 from ..checks import number, pick
 from ..cycles.attractors import MAYBE_SAME, distance, place_of
-from ..cycles.chains import SIZES, cut
-from ..cycles.cycle import Cycle, cycle_from, exactly
+from ..cycles.backwards import solved
+from ..cycles.chains import SIZES
+from ..cycles.cycle import Cycle, cycle_from
 from ..cycles.unstable import separating_loop
 from ..model.equilibria import Equilibria, EquilibriumKind, equilibria
 from ..model.oscillator import Oscillator
@@ -74,9 +75,9 @@ def sides_of(
 
 
 def _side_at(value, osc, across, cycles, places, others, other_places) -> Side:
-    ok, rests = jnp.asarray(Status.OK.value), equilibria(osc)
+    rests = equilibria(osc)
     ended = [
-        exactly(osc, cut([one.loop])[0], ok)
+        solved(osc, one.loop)
         for one, place in zip(cycles, places, strict=True)
         if not any(
             one.path == other.path and distance(place, at) < MAYBE_SAME

@@ -148,7 +148,7 @@ def motions_in_cells(
     rests = [still.kind, still.stable, still.modes.reshape(count, -1)]
     facts = np.concatenate([decided[:, None], opposite[:, None], *rests, cycles], axis=1)
     kinds, first, which = np.unique(facts, axis=0, return_index=True, return_inverse=True)
-    edged, belts = _is_edged(make(**_arguments(names, points[0]))), still.velocities.shape[1]
+    edged, belts = _is_edged(made_at(make, names, points[0])), still.velocities.shape[1]
     named, numbers, known = [], [], {}
     for row, cell in zip(kinds.tolist(), first.tolist(), strict=True):
         here = still.kind[cell] > 0
@@ -162,8 +162,9 @@ def motions_in_cells(
     return Cells(np.array(named)[which], np.array(numbers)[which], _on_line(still))
 
 
-def _arguments(names: Sequence[str], point: Any) -> dict[str, float]:
-    return dict(zip(names, map(float, point), strict=True))
+def made_at(make: Callable[..., Oscillator], names: Sequence[str], point: Any) -> Oscillator:
+    """The oscillator that a function of two arguments makes at a point of the plane."""
+    return make(**dict(zip(names, map(float, point), strict=True)))
 
 
 def _on_line(still: "_Still") -> np.ndarray:
@@ -229,7 +230,7 @@ def _cycles_at(make, names, points, still: _Still, more: np.ndarray):
     runs = Runs(places, signatures[which.reshape(kinds.shape)], RUN * RUN_TOLERANCE)
     cycles = np.where(kinds == CYCLE, kinds, UNDECIDED)
     labels = numbers_of_attractors(
-        cycles, sticks, runs, lambda point: make(**_arguments(names, points[point]))
+        cycles, sticks, runs, lambda point: made_at(make, names, points[point])
     )
     codes = sticks @ 2 ** np.arange(belts)
     sorts: dict[tuple[str, int], int] = {}

@@ -29,7 +29,6 @@ from ..dimensions import EXTENT
 from ..model.events import signature_name
 from ..model.oscillator import Oscillator, has_clock
 from ..model.own_units import in_own_units, rescaled
-from ..model.parameters import leaf_index
 from ..model.variations import WITH_A_CLOCK, Variation, as_span, varied
 from ..numerics.compiling import compiled_beside
 from ..results import Status, draw
@@ -232,7 +231,7 @@ def _is_forced(osc: Any, where: Any, span: Any) -> bool:
     """Whether what is varied knows the time."""
     if isinstance(osc, Oscillator) or not callable(osc):
         return isinstance(osc, Oscillator) and has_clock(osc)
-    ends = as_span(span, where)
+    ends = as_span(osc, where, span)
     made = [_made_by(osc, end) for end in ends]
     clocks = [has_clock(one) for one in made if one is not None]
     require(len(set(clocks)) < 2, "span", WITH_A_CLOCK, ends)
@@ -250,15 +249,10 @@ def _made_by(make: Any, value: float) -> Oscillator | None:
 
 def _forced_diagram(osc: Any, where: Any, span: Any, start: Any) -> BifurcationDiagram:
     """`bifurcation_diagram` of a forced oscillator."""
-    if isinstance(osc, Oscillator):
-        leaf_index(osc, where)
-    first, last = as_span(span, where)
+    first, last = as_span(osc, where, span)
     given = varied(osc, where, (first,), forced=True)
-    for value in (first, last):
-        given.check(value)
+    variation = given.over(first, last)
     given.check_clock((first, last))
-    ends = np.array([[0.5 * (first + last)], [first], [last]])
-    variation = given.in_own_units(*ends)
     (unit,), length = variation.own.parameters, variation.own.length
     limits = np.array([[first, last]]) / unit
     motion, value = _start_of_branch(variation, limits, start)

@@ -413,14 +413,8 @@ def _edge_rests(osc: Oscillator, belt: int | Array) -> tuple[EdgeRest, Array]:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *cases), exists
 
 
-@jit
-def _across_edge(system: EdgeRest, osc: Oscillator) -> tuple[Array, Array]:
-    return system.across(osc)
-
-
-@jit
-def _loop_growth(system: EdgeBalance, osc: Oscillator) -> tuple[Array, Array]:
-    return system.growth(osc)
+_across_edge = jit(EdgeRest.across)
+_loop_growth = jit(EdgeBalance.growth)
 
 
 def _edge_balances(osc: Oscillator, belt: int | Array) -> EdgeBalance:

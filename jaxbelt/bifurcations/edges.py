@@ -11,7 +11,6 @@ Grazing and corner collision are the names of M. di Bernardo, C. Budd, A. Champn
 Piecewise-smooth Dynamical Systems, 2008.
 """
 
-import abc
 from typing import ClassVar
 
 import equinox as eqx
@@ -101,27 +100,16 @@ class AbstractEdgeTouch(AbstractCycleCondition):
 
     Of all attracting cycles the one that comes nearest to this is taken. wanted: 1 for an extremum
     of x1 (grazing), -1 for a boundary or slip onset (a corner), 0 for either. repels: the cycle is
-    the one from `unstable_cycle`, not an attracting one.
+    the one from `unstable_cycle`, not an attracting one. farther: ends of arcs that are no farther
+    from both are left out.
     """
 
     belt: int | Array
 
+    wanted = 0.0
+    farther = -1.0
+    repels = False
     has_several: ClassVar[bool] = True
-
-    @property
-    @abc.abstractmethod
-    def wanted(self) -> float | Array:
-        """The second event: see the class."""
-
-    @property
-    def repels(self) -> bool:
-        """Whether the condition is on the unstable cycle."""
-        return False
-
-    @property
-    def farther(self) -> float | Array:
-        """Ends of arcs that are no farther from both are left out."""
-        return -1.0
 
     @property
     def room(self):
@@ -129,7 +117,7 @@ class AbstractEdgeTouch(AbstractCycleCondition):
 
     @property
     def sought(self):
-        return EdgeTouch(self.belt, unstable=self.repels)
+        return EdgeTouch(self.belt, repels=self.repels)
 
     def check(self, osc):
         super().check(osc)
@@ -190,21 +178,9 @@ class AbstractEdgeTouch(AbstractCycleCondition):
 class EdgeTouch(AbstractEdgeTouch):
     """Such an end with either second event, as data for programs."""
 
-    meant: float | Array = 0.0
-    least: float | Array = -1.0
-    unstable: bool = eqx.field(static=True, default=False)
-
-    @property
-    def wanted(self):
-        return self.meant
-
-    @property
-    def farther(self):
-        return self.least
-
-    @property
-    def repels(self):
-        return self.unstable
+    wanted: float | Array = 0.0
+    farther: float | Array = -1.0
+    repels: bool = eqx.field(static=True, default=False)
 
 
 class GrazingEdge(AbstractEdgeTouch):
@@ -222,12 +198,9 @@ class GrazingEdge(AbstractEdgeTouch):
 
     unstable: bool = eqx.field(static=True, default=False)
 
+    wanted = 1.0
     caption: ClassVar[str] = "edge grazing, belt {belt}"
     line: ClassVar[Line] = Line("edge grazing", "#56B4E9")
-
-    @property
-    def wanted(self):
-        return 1.0
 
     @property
     def repels(self):
@@ -265,12 +238,9 @@ class CornerCollision(AbstractEdgeTouch):
         belt: Number of the belt.
     """
 
+    wanted = -1.0
     caption: ClassVar[str] = "corner, belt {belt}"
     line: ClassVar[Line] = Line("corner", "#56B4E9", (0, (3, 1, 1, 1)))
-
-    @property
-    def wanted(self):
-        return -1.0
 
     def with_clock(self):
         return TimedCorner(int(self.belt), type(self))

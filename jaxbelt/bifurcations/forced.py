@@ -26,12 +26,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..checks import as_array, check_finite, is_concrete, require
+from ..checks import as_finite, is_concrete, require
 from ..cycles.chains import Loop, padded_loop
 from ..cycles.clocked import (
     guards_along,
-    least_steps,
-    timed_chain,
+    timed_chain_of,
     turns_of,
 )
 from ..cycles.periodic import (
@@ -53,7 +52,7 @@ from ..model.variations import Variation
 from ..motion.arcs import Ends
 from ..numerics.compiling import jit
 from ..results import Status
-from .base import AbstractCondition, BifurcationPoint, Line, point_of
+from .base import AbstractCondition, BifurcationPoint, Line, point_of, point_without_cycle
 from .systems import solve_system
 from .timed_systems import AtLimit, OnUnitCircle, TimedSystem, Touching, place_of_motion
 
@@ -190,11 +189,10 @@ class AbstractForcedCondition(AbstractCondition):
         return None if nearest is None else replace(nearest, condition=self)
 
     def prepared(self, osc, guess):
-        loop = guess.rows.loop()
-        size, share = least_steps(osc, loop), guess.rows.share
-        chain, z = _chain_of_motion(osc, loop, size, turns_of(osc), share)
+        rows = guess.rows
+        chain, z = timed_chain_of(osc, rows.loop(), turns_of(osc), rows.share)
         system = guess.system(chain)
-        return _refined(osc, system, z), z, jnp.asarray(Status.OK.value)
+        return _refined(system, osc, z), z, jnp.asarray(Status.OK.value)
 
     def point_near(self, family, system, x, p, status):
         return _solved_timed_point(family, system, x, p, status)
@@ -212,12 +210,7 @@ class AbstractForcedCondition(AbstractCondition):
         return place_of_motion(point.cycle)
 
 
-_chain_of_motion = jit(timed_chain)
-
-
-@jit
-def _refined(osc: Oscillator, system: TimedSystem, x: Array) -> TimedSystem:
-    return system.refined(osc, x)
+_refined = jit(TimedSystem.refined)
 
 
 @jit
@@ -266,21 +259,11 @@ def forced_point(
         return replace(nearest, condition=condition)
     if found:
         return replace(found[0], condition=condition)
+    nan, none = jnp.asarray(jnp.nan), jnp.asarray(Status.NOT_TOUCHED.value)
+    family, steps = variation.family(value), jnp.full(1, jnp.nan)
+    point = point_without_cycle(family, value, steps, nan, nan, none, none)
     nothing = nothing_found(own, turns, Status.NOT_TOUCHED)
-    nan = jnp.asarray(jnp.nan)
-    return BifurcationPoint(
-        condition=condition,
-        value=nan,
-        residual=nan,
-        iterations=jnp.asarray(0),
-        steps=jnp.full(1, jnp.nan),
-        error=nan,
-        multiplier=nan,
-        x1=nan,
-        oscillator=own,
-        cycle=nothing,
-        status=jnp.asarray(Status.NOT_TOUCHED.value),
-    )
+    return replace(point, condition=condition, oscillator=own, cycle=nothing)
 
 
 def motions_to_begin_from(osc: OwnOscillator, start: Any, turns: int) -> Sequence[PeriodicMotion]:
@@ -289,8 +272,7 @@ def motions_to_begin_from(osc: OwnOscillator, start: Any, turns: int) -> Sequenc
     if isinstance(start, PeriodicMotion):
         return [rescaled(start, 1 / osc.units.length, lambda _: osc)]
     if start is not None:
-        start = as_array(start, "start", (2,))
-        check_finite(start, "start")
+        start = as_finite(start, "start", (2,))
         motion = attracted(osc, np.asarray(osc.units.into(start)), turns)
         found = [motion] if int(motion.status) == Status.OK else []
     else:

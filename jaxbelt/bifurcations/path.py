@@ -39,15 +39,15 @@ from ..cycles.attractors import (
     sticks,
     without_idle,
 )
+from ..cycles.backwards import solved
 from ..cycles.chains import SIZES, Loop, cut
-from ..cycles.cycle import Cycle, as_loop, cycle_from, exactly, polish
+from ..cycles.cycle import Cycle, as_loop, cycle_from, polish
 from ..cycles.orbits import FINE_STRIDE
 from ..cycles.settling import AT_REST
 from ..cycles.unstable import among_all, from_starts
 from ..model.equilibria import EquilibriumKind, candidates
 from ..model.far_out import is_bounded
 from ..model.oscillator import Oscillator
-from ..model.parameters import leaf_index
 from ..model.variations import as_span, varied
 from ..motion.integrators import STRIDE
 from ..numerics.compiling import each, jit
@@ -82,24 +82,18 @@ class ParameterPath:
     ):
         #: Whether labels contain courses, which change basins only and nothing that attracts.
         self.basins = basins
-        # `where` first: where it is left out, the span stands in its place.
-        if isinstance(osc, Oscillator):
-            leaf_index(osc, where)
-        first, last = as_span(span, where)
+        first, last = as_span(osc, where, span)
         given = varied(osc, where, (first,))
         known = "of known numbers: paths are not for jit, vmap or derivatives"
         at_first = given.oscillator(np.array([first]))
         require(is_concrete(at_first), "osc", known, "a traced one")
         conditions = check_conditions(conditions)
-        for value in (first, last):
-            given.check(value)
+        #: In own units, the parameter too, like everything that follows.
+        self.variation = given.over(first, last)
         #: The given oscillator, or the one at the first value.
         self.osc = osc if isinstance(osc, Oscillator) else at_first
         for condition in conditions:
             condition.check(self.osc)
-        #: In own units, the parameter too, like everything that follows.
-        ends = np.array([[0.5 * (first + last)], [first], [last]])
-        self.variation = given.in_own_units(*ends)
         self._oscillators: dict[float, Oscillator] = {}
         self._idle: dict[float, np.ndarray] = {}
         measured = 1.0 if given.units is not None else float(self.variation.own.parameters[0])
@@ -487,8 +481,7 @@ def _is_found(cycle: Cycle) -> bool:
 
 def _gone_on(osc: Oscillator, beside: Cycle) -> Cycle | None:
     """The cycle that an unstable cycle at a neighbouring value continues to."""
-    loop = jax.tree.map(np.asarray, as_loop(beside, ROOM))
-    cycle = exactly(osc, cut([loop])[0], jnp.asarray(Status.OK.value))
+    cycle = solved(osc, jax.tree.map(np.asarray, as_loop(beside, ROOM)))
     return cycle if _is_beside(beside, cycle) and float(cycle.multiplier) > 1 else None
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 
 from ..activity import announced
-from ..checks import as_array, as_whole, check_finite, is_concrete, require, require_value
+from ..checks import as_finite, as_whole, is_concrete, require, require_value
 from ..cycles.cycle import warn_of_extrapolation
 from ..model.oscillator import Oscillator, check_oscillator, has_clock
 from ..model.parameters import leaf_index
@@ -212,8 +212,7 @@ def _begun(
         own = variation.own.of(osc)
         return variation, own, value / variation.own.parameters
     require(at is not None, "at", "the value of the parameter to begin from", "None")
-    at = as_array(at, "at")
-    check_finite(at, "at")
+    at = as_finite(at, "at")
     variation = varied(osc, where, (at,), forced=True)
     if is_concrete(at):
         variation.check(float(at))

@@ -18,10 +18,10 @@ from jaxtyping import ArrayLike
 from ..activity import announced, note_progress
 from ..checks import (
     as_array,
+    as_finite,
     as_positive,
     as_whole,
     check_arguments,
-    check_finite,
     outside_of_traces,
     refuse_interval,
     require_one_of,
@@ -35,7 +35,7 @@ from ..numerics.widths import as_here
 from ..results import draw
 from ..tables import table_of
 from .bounds import Bounds, Pair
-from .cells import in_plane_of_paper, motions_in_cells
+from .cells import in_plane_of_paper, made_at, motions_in_cells
 from .curves import BifurcationCurve, given_curve
 from .faces import Faces
 
@@ -117,7 +117,7 @@ class RegionMap(eqx.Module):
 
     def oscillator(self, name: str) -> Oscillator:
         """The oscillator in the cell of `example`."""
-        return _at(self.make, self.names, self.example(name))
+        return made_at(self.make, self.names, self.example(name))
 
     @property
     def as_paper(self) -> bool:
@@ -126,7 +126,7 @@ class RegionMap(eqx.Module):
         Pictures show the names of the regions there only.
         """
         corners = [(p, q) for p in self.values[0][[0, -1]] for q in self.values[1][[0, -1]]]
-        return in_plane_of_paper([_at(self.make, self.names, corner) for corner in corners])
+        return in_plane_of_paper([made_at(self.make, self.names, corner) for corner in corners])
 
     def raster(self) -> np.ndarray:
         """Names on an even raster over the plane, [pixels, pixels], the first parameter along the
@@ -299,13 +299,9 @@ def _cycles_of_examples(make, names, values, label) -> dict[str, tuple[Cycle, ..
     cycles = {}
     for name in sorted(set(np.unique(label).tolist()) - {""}):
         note_progress(f"the portrait of region {name}")
-        found = portrait(_at(make, names, _example(values, label == name)))
+        found = portrait(made_at(make, names, _example(values, label == name)))
         cycles[name] = (*found.cycles, *found.unstable)
     return cycles
-
-
-def _at(make, names, pair) -> Oscillator:
-    return make(**dict(zip(names, map(float, pair), strict=True)))
 
 
 def _faces_of(values, label, on_line, curves) -> tuple[Faces, np.ndarray, list[str]]:
@@ -336,8 +332,7 @@ def _checked_starts(starts: Any) -> tuple[tuple[float, float], ...]:
         return ()
     shape = np.shape(starts) if isinstance(starts, tuple | list | np.ndarray) else ()
     require_value(len(shape) == 2 and shape[0] and shape[1] == 2, "starts", expected, starts)
-    rows = as_array(starts, "starts", (None, 2))
-    check_finite(rows, "starts")
+    rows = as_finite(starts, "starts", (None, 2))
     return tuple((float(x1), float(x2)) for x1, x2 in np.asarray(rows))
 
 

@@ -149,9 +149,7 @@ class AbstractRestOfSeveral(AbstractRestCondition):
         return _of_row((systems, x), row)
 
 
-@jit
-def _of_row(tree: Any, row: Array) -> Any:
-    return pick(tree, row)
+_of_row = jit(pick)
 
 
 @jit

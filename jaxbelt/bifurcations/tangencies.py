@@ -14,7 +14,6 @@ The paper's cycles end with a nonsmooth fold (its section 3); grazing-sliding is
 Bernardo, C. Budd, A. Champneys, P. Kowalczyk, Piecewise-smooth Dynamical Systems, 2008.
 """
 
-import abc
 from typing import ClassVar
 
 import equinox as eqx
@@ -110,14 +109,10 @@ class AbstractTangency(AbstractStickCondition):
     wanted: 1 a fold, -1 grazing, 0 either.
     """
 
+    wanted = 0.0
     group: ClassVar[str] = "tangency"
     more_arcs: ClassVar[int] = 1
     bends: ClassVar[bool] = True
-
-    @property
-    @abc.abstractmethod
-    def wanted(self) -> float | Array:
-        """The kind to solve for: see the class."""
 
     @property
     def sought(self):
@@ -187,11 +182,7 @@ class AbstractTangency(AbstractStickCondition):
 class Tangency(AbstractTangency):
     """A tangency of either kind, as data for programs."""
 
-    meant: float | Array = 0.0
-
-    @property
-    def wanted(self):
-        return self.meant
+    wanted: float | Array = 0.0
 
 
 class NonsmoothFold(AbstractTangency):
@@ -201,12 +192,9 @@ class NonsmoothFold(AbstractTangency):
         belt: Number of the belt.
     """
 
+    wanted = 1.0
     caption: ClassVar[str] = "nonsmooth fold, belt {belt}"
     line: ClassVar[Line] = Line("nonsmooth fold", "black")
-
-    @property
-    def wanted(self):
-        return 1.0
 
 
 class GrazingSliding(AbstractTangency):
@@ -216,12 +204,9 @@ class GrazingSliding(AbstractTangency):
         belt: Number of the belt.
     """
 
+    wanted = -1.0
     caption: ClassVar[str] = "grazing, belt {belt}"
     line: ClassVar[Line] = Line("grazing", "#CC79A7")
-
-    @property
-    def wanted(self):
-        return -1.0
 
     def with_clock(self):
         return TimedGrazing(int(self.belt), type(self))

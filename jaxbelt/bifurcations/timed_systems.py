@@ -15,7 +15,6 @@ from ..cycles.clocked import (
     guard_slope,
     monodromy,
     monodromy_and_slopes,
-    sticks_in,
     timed_blocks,
     timed_chain,
     timed_residual,
@@ -109,7 +108,7 @@ class OnUnitCircle(TimedSystem):
     def _of(self, matrix: Array) -> Array:
         trace = matrix[0, 0] + matrix[1, 1]
         det = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
-        det = jnp.where(sticks_in(self.chain), 0.0, det)
+        det = jnp.where(self.chain.sticks, 0.0, det)
         return self.parts[0] + self.parts[1] * trace + self.parts[2] * det
 
     def condition(self, osc, z):

@@ -38,9 +38,6 @@ class BackwardCycle(Cycle):
         states = sampled_chain(behind, *given)
         return jnp.flip(states, axis=0) * jnp.array([[1.0, -1.0]])
 
-    def __repr__(self) -> str:
-        return Cycle.__repr__(self)
-
 
 def moved_in_time(osc: Oscillator, way: Array | float) -> Oscillator:
     """The oscillator itself, way = 1, or the one reversed in time, way = -1."""

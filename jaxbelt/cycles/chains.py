@@ -52,6 +52,11 @@ class Chain(eqx.Module):
         return self.ends != Ends(self.codes.shape[-1]).unused
 
     @property
+    def sticks(self) -> Array:
+        """Whether there is a stick phase."""
+        return jnp.any(self.used[:, None] & (self.codes == 0))
+
+    @property
     def halved(self) -> "Chain":
         """The same chain with every integration step halved."""
         return replace(self, mesh=jnp.repeat(self.mesh / 2, 2, axis=-1))

@@ -31,7 +31,6 @@ from ..model.instants import carried, guards_at, guards_trend, trend_of
 from ..model.modes import capacity, mode_acceleration, mode_of, select, stick_velocity
 from ..model.oscillator import Oscillator, at_time, frequencies
 from ..motion.arcs import Ends
-from ..motion.integrators import density
 from ..numerics.compiling import any_lane, jit, power_of_two
 from ..numerics.implicit import Equations, step_to_root
 from ..numerics.newton import HOLDS
@@ -41,8 +40,10 @@ from .shooting import (
     ARC_STEPS,
     FINE,
     arc_by_arc,
+    arc_columns,
     arc_step,
     coarse_step,
+    densities,
     directions_of,
     end_guard,
     flow,
@@ -123,17 +124,8 @@ def _counted_ends(osc: Oscillator, codes: Array, entries: Array, durations: Arra
 def timed_mesh(osc: Oscillator, size: int, codes: Array, y: Array, duration: Array) -> Array:
     """Steps as fractions of the duration of a slip arc, [size]: as many as it needs, and zeros."""
     n = PLACING * size
-
-    def march():
-        def advance(y, _):
-            return coarse_step(osc, codes, y, duration / n)
-
-        return lax.scan(advance, y, None, length=n)[1]
-
     slips = ~mode_of(codes).any_stuck & (duration > 0)
-    rest = lax.cond(any_lane(slips), march, lambda: jnp.ones(n))
-    rho = jnp.concatenate([density(osc, mode_of(codes), y[0], y[1], y[2])[None], rest])
-    rho = jnp.clip(jnp.nan_to_num(rho, nan=1.0), 1.0, 100.0)
+    rho = densities(osc, n, codes, y, duration, slips)
     share = jnp.concatenate([jnp.zeros(1), jnp.cumsum(0.5 * (rho[1:] + rho[:-1]))])
     count = jnp.clip(jnp.ceil(duration * share[-1] / n / TIMED_STRIDE), 1, size)
     places = jnp.minimum(jnp.arange(size + 1.0) / count, 1.0)
@@ -151,6 +143,16 @@ def timed_chain(
     z = jnp.concatenate([loop.entries, loop.durations[:, None]], axis=1)
     chain = TimedChain(loop.codes, loop.ends, mesh, turns=turns, share=share)
     return lax.stop_gradient((chain, z))
+
+
+_compiled_chain = jit(timed_chain)
+
+
+def timed_chain_of(
+    osc: Oscillator, loop: Loop, turns: int, share: Array | None = None
+) -> tuple[TimedChain, Array]:
+    """`timed_chain` of a known loop, with as many steps as its arcs need."""
+    return _compiled_chain(osc, loop, least_steps(osc, loop), turns, share)
 
 
 # --- equations ------------------------------------------------------------------------------------
@@ -199,10 +201,6 @@ _timed_equations = _by_turns(_timed_arc_equations)
 _timed_equations_and_blocks = _by_turns(_and_columns)
 
 
-def _timed_rows(chain: TimedChain, z: Array) -> tuple[Array, ...]:
-    return chain.codes, chain.ends, chain.mesh, z
-
-
 def _timed_mismatch(out: Array, z: Array) -> Array:
     exits = out[:, :3] - jnp.roll(z[:, :3], -1, axis=0)
     return jnp.concatenate([exits, out[:, 3:4]], axis=1)
@@ -210,14 +208,14 @@ def _timed_mismatch(out: Array, z: Array) -> Array:
 
 def timed_residual(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
     """The 4N equations at the unknowns z, [N, 4]: mismatch of x1, x2, t, and the guard."""
-    rows = _timed_rows(chain, z)
+    rows = arc_columns(chain, z)
     return _timed_mismatch(_timed_equations(chain.turns)((osc, chain.share), rows), z)
 
 
 def timed_blocks(osc: Oscillator, along: Oscillator | None, chain: TimedChain, z: Array):
     """`timed_residual`, and its derivatives as `shooting.residual_and_blocks` has them."""
     given = osc, along, chain.share
-    out, blocks = _timed_equations_and_blocks(chain.turns)(given, _timed_rows(chain, z))
+    out, blocks = _timed_equations_and_blocks(chain.turns)(given, arc_columns(chain, z))
     return _timed_mismatch(out, z), blocks
 
 
@@ -265,7 +263,7 @@ def _maps_and_slopes(turns, osc, along, share, codes, end, mesh, unknown: Array)
 
 def arc_maps(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
     """`_arc_map` of all arcs, [N, 3, 3]."""
-    return _arc_maps(chain.turns)((osc, chain.share), _timed_rows(chain, z))
+    return _arc_maps(chain.turns)((osc, chain.share), arc_columns(chain, z))
 
 
 def _product(maps: Array) -> Array:
@@ -298,7 +296,7 @@ def monodromy_and_slopes(
 ) -> tuple[Array, Array, Array]:
     """`monodromy`, and its derivatives by z, [2, 2, N, 4], and along directions, [2, 2, k]."""
     given = osc, along, chain.share
-    maps, slopes = _maps_and_slopes(chain.turns)(given, _timed_rows(chain, z))
+    maps, slopes = _maps_and_slopes(chain.turns)(given, arc_columns(chain, z))
 
     def times(total, one):
         return one @ total, total
@@ -310,11 +308,6 @@ def monodromy_and_slopes(
     _, behind = lax.scan(times_behind, jnp.eye(3), maps, reverse=True)
     moved = jnp.einsum("nij,njkd,nkl->ilnd", behind, slopes, before)[:2, :2]
     return matrix[:2, :2], moved[..., :4], jnp.sum(moved[..., 4:], axis=2)
-
-
-def sticks_in(chain: Chain) -> Array:
-    """Whether a chain has a stick phase."""
-    return jnp.any(chain.used[:, None] & (chain.codes == 0))
 
 
 def multipliers_of(matrix: Array, sticks: Array) -> Array:
@@ -363,18 +356,22 @@ def states_along(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration:
 
     A stick arc is cut into steps of one length.
     """
-    stuck = mode_of(codes).any_stuck
-    fractions = jnp.where(stuck, jnp.full_like(mesh, 1 / mesh.size), mesh)
+    fractions = jnp.where(mode_of(codes).any_stuck, jnp.full_like(mesh, 1 / mesh.size), mesh)
 
     def advance(state, fraction):
-        h = duration * fraction
-        slipped = arc_step(functools.partial(slip_slopes, osc, codes), state, h, FINE)
-        held = jnp.stack(carried(osc, mode_of(codes), (state[0], state[1], state[2]), h))
-        new = jnp.where(stuck, held, slipped)
+        new = _after(osc, codes, state, duration * fraction)
         return new, new
 
     _, states = lax.scan(advance, y, fractions)
     return jnp.concatenate([y[None], states])
+
+
+def _after(osc: Oscillator, codes: Array, y: Array, h: Array) -> Array:
+    """The state of an arc a time h after y."""
+    mode = mode_of(codes)
+    slipped = arc_step(functools.partial(slip_slopes, osc, codes), y, h, FINE)
+    held = jnp.stack(carried(osc, mode, (y[0], y[1], y[2]), h))
+    return jnp.where(mode.any_stuck, held, slipped)
 
 
 @jit
@@ -470,9 +467,7 @@ def _least(
     h = states[step + 1, 2] - before[2]
 
     def state(s):
-        slipped = arc_step(functools.partial(slip_slopes, osc, codes), before, s * h, FINE)
-        held = jnp.stack(carried(osc, mode, (before[0], before[1], before[2]), s * h))
-        return jnp.where(mode.any_stuck, held, slipped)
+        return _after(osc, codes, before, s * h)
 
     def function(y):
         return jnp.dot(weight, jnp.stack(y[:2]))

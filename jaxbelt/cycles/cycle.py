@@ -17,9 +17,8 @@ from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
 from ..checks import (
-    as_array,
+    as_finite,
     as_whole,
-    check_finite,
     is_concrete,
     number,
     pick,
@@ -88,25 +87,9 @@ class Cycle(ClosedMotion):
         """Duration of one loop, in dimensionless time tau."""
         return jnp.sum(self.unknowns[..., 2], axis=-1)
 
-    @property
-    def x1_min(self) -> Array:
-        """Smallest displacement."""
-        return jnp.min(self.unknowns[..., 0], axis=-1)
-
-    @property
-    def x1_max(self) -> Array:
-        """Largest displacement."""
-        return jnp.max(self.unknowns[..., 0], axis=-1)
-
-    @property
-    def x2_min(self) -> Array:
-        """Smallest velocity."""
-        return jnp.min(self.unknowns[..., 1], axis=-1)
-
-    @property
-    def x2_max(self) -> Array:
-        """Largest velocity."""
-        return jnp.max(self.unknowns[..., 1], axis=-1)
+    def _extremum(self, number):
+        column = self.unknowns[..., number // 2]
+        return (jnp.max if number % 2 else jnp.min)(column, axis=-1)
 
     @property
     def stable(self) -> Array:
@@ -214,7 +197,7 @@ def cycle_of(
     else:
         residual = error
     status = first_failure(status, admissible(osc, chain, z), Status.NOT_ADMISSIBLE)
-    sticks = jnp.any(chain.used[:, None] & (chain.codes == 0))
+    sticks = chain.sticks
     # An equilibrium solves the equations, too, with arcs of any duration.
     moves = sticks | (jnp.max(z[:, 1]) - jnp.min(z[:, 1]) > HOLDS)
     status = first_failure(status, moves, Status.NO_CONVERGENCE)
@@ -443,8 +426,7 @@ def find_cycle(osc: Oscillator, y0: ArrayLike | tuple, *, max_arcs: int | None =
         ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(osc)
-    y0 = as_array(y0, "y0", (2,))
-    check_finite(y0, "y0")
+    y0 = as_finite(y0, "y0", (2,))
     if has_clock(osc):
         return motion_reached(osc, y0)
     room = None if max_arcs is None else as_whole(max_arcs, "max_arcs")

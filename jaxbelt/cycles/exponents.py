@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
-from ..checks import as_array, as_whole, check_finite, is_concrete, number, require
+from ..checks import as_finite, as_whole, is_concrete, number, require
 from ..model.modes import STUCK
 from ..model.oscillator import Oscillator, check_clock, check_oscillator
 from ..model.own_units import in_own_units
@@ -121,8 +121,7 @@ def lyapunov(
     """
     check_oscillator(osc)
     check_clock(osc, "lyapunov", "the multiplier of jb.find_cycle")
-    y0 = as_array(y0, "y0", (2,))
-    check_finite(y0, "y0")
+    y0 = as_finite(y0, "y0", (2,))
     periods = as_whole(periods, "periods", BLOCKS)
     transient = as_whole(transient, "transient", 0)
     require(is_concrete((osc, y0)), "osc", "known: not under jit or vmap", "a traced one")

@@ -1,5 +1,6 @@
 """What cycles and periodic motions of forced oscillators have in common: `ClosedMotion`."""
 
+import abc
 import functools
 from typing import Any
 
@@ -30,6 +31,30 @@ class ClosedMotion(eqx.Module):
     chain: eqx.AbstractVar[Any]
     unknowns: eqx.AbstractVar[Array]
     status: eqx.AbstractVar[Array]
+
+    @property
+    def x1_min(self) -> Array:
+        """Smallest displacement."""
+        return self._extremum(0)
+
+    @property
+    def x1_max(self) -> Array:
+        """Largest displacement."""
+        return self._extremum(1)
+
+    @property
+    def x2_min(self) -> Array:
+        """Smallest velocity."""
+        return self._extremum(2)
+
+    @property
+    def x2_max(self) -> Array:
+        """Largest velocity."""
+        return self._extremum(3)
+
+    @abc.abstractmethod
+    def _extremum(self, number: int) -> Array:
+        """The smallest x1 (0), the largest x1 (1), or the same of x2 (2, 3)."""
 
     @property
     def stick_durations(self) -> Array:

@@ -16,9 +16,8 @@ from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
 from ..checks import (
-    as_array,
+    as_finite,
     as_whole,
-    check_finite,
     is_concrete,
     number,
     require,
@@ -39,13 +38,11 @@ from .clocked import (
     TimedClosed,
     extrema_along,
     forcing_period,
-    least_steps,
     monodromy,
     multipliers_of,
     states_at_phase,
-    sticks_in,
     timed_admissible,
-    timed_chain,
+    timed_chain_of,
     timed_residual,
     turns_of,
 )
@@ -149,25 +146,8 @@ class PeriodicMotion(ClosedMotion):
         cuts = np.flatnonzero(np.asarray(self.chain.ends) == self._ends.period)
         return self.unknowns[jnp.asarray(np.append(0, cuts[:-1] + 1)), :2]
 
-    @property
-    def x1_min(self) -> Array:
-        """Smallest displacement."""
-        return extrema_of(self)[..., 0]
-
-    @property
-    def x1_max(self) -> Array:
-        """Largest displacement."""
-        return extrema_of(self)[..., 1]
-
-    @property
-    def x2_min(self) -> Array:
-        """Smallest velocity."""
-        return extrema_of(self)[..., 2]
-
-    @property
-    def x2_max(self) -> Array:
-        """Largest velocity."""
-        return extrema_of(self)[..., 3]
+    def _extremum(self, number):
+        return extrema_of(self)[..., number]
 
     @property
     def stable(self) -> Array:
@@ -324,7 +304,7 @@ def motion_at(osc, chain, z, residual, iterations, status) -> PeriodicMotion:
 
 def _motion(osc, chain, z, residual, iterations, status) -> PeriodicMotion:
     known = jnp.where(status == Status.OK, 1.0, jnp.nan)
-    found = multipliers_of(monodromy(osc, chain, z), sticks_in(chain))
+    found = multipliers_of(monodromy(osc, chain, z), chain.sticks)
     found, numbers = found * known.astype(complex), (residual * known, iterations, status)
     return PeriodicMotion(osc, chain, z * known, found, *numbers)
 
@@ -337,15 +317,12 @@ def _motion_with_derivatives(osc: Oscillator, motion: PeriodicMotion) -> Periodi
     return _motion(osc, chain, z, motion.residual, motion.iterations, status)
 
 
-_timed_chain_of = jit(timed_chain)
-
-
 def solved_from(
     osc: Oscillator, loop: Loop, turns: int, share: Array | None = None
 ) -> PeriodicMotion:
     """The motion that a loop nearly is, with as many steps of integration as it takes; share: see
     `TimedChain`."""
-    chain, guess = _timed_chain_of(osc, loop, least_steps(osc, loop), turns, share)
+    chain, guess = timed_chain_of(osc, loop, turns, share)
     motion, error = _polished_motion(osc, chain, guess)
     for _ in range(MESH_HALVINGS):
         converged = int(motion.status) in (Status.OK, Status.NOT_ADMISSIBLE)
@@ -495,7 +472,7 @@ def _period_step(
     """How far the state where periods begin is from that of a periodic motion, by Newton's method
     along the orbit as it was followed."""
     loop = followed.loop()
-    chain, z = _timed_chain_of(osc, loop, least_steps(osc, loop), turns, begins)
+    chain, z = timed_chain_of(osc, loop, turns, begins)
     matrix = np.asarray(_monodromy_of(osc, chain, z))
     miss = followed.starts[-1] - followed.starts[0]
     if not np.all(np.isfinite(matrix)):
@@ -543,8 +520,7 @@ def periodic(osc: Oscillator, guess: ArrayLike | tuple, *, periods: int = 1) -> 
     """
     check_oscillator(osc)
     check_clock(osc, "periodic", "jb.find_cycle or jb.unstable_cycle")
-    guess = as_array(guess, "guess", (2,))
-    check_finite(guess, "guess")
+    guess = as_finite(guess, "guess", (2,))
     periods = as_whole(periods, "periods")
     require(periods <= PERIODS_AT_ONCE, "periods", f"at most {PERIODS_AT_ONCE}", periods)
     return _differentiable_motion(

@@ -20,7 +20,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
-from ..checks import as_array, as_whole, check_finite, is_concrete, number, require, require_one_of
+from ..checks import as_finite, as_whole, is_concrete, number, require, require_one_of
 from ..model.oscillator import Oscillator, check_oscillator, refuse_clock
 from ..model.own_units import OwnOscillator, in_given_units, in_units_of_run, quantity, rescaled
 from ..results import Status, describe, draw
@@ -176,8 +176,7 @@ def minimal_fatal_shock(
     osc = osc.oscillator if isinstance(osc, Portrait) else osc
     check_oscillator(osc)
     refuse_clock(osc, "minimal_fatal_shock", "jb.simulate from several starts")
-    y0 = as_array(y0, "y0", (2,))
-    check_finite(y0, "y0")
+    y0 = as_finite(y0, "y0", (2,))
     require_one_of(direction, DIRECTIONS, "direction")
     given, osc = osc, in_units_of_run(osc)
     y0 = y0 / osc.units.length

@@ -122,6 +122,22 @@ def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) 
     if steps > EVEN_STEPS:
         return _marched_mesh(osc, steps, codes, y, duration)
     n = 24
+    # Stick phases, and the padding of a chain, take no steps.
+    rho = densities(osc, n, codes, y, duration, duration != 0)
+    share = jnp.concatenate([jnp.zeros(1), jnp.cumsum(rho[1:] + rho[:-1])])
+    grid = jnp.interp(
+        jnp.linspace(0.0, 1.0, steps + 1), share / share[-1], jnp.linspace(0, 1, n + 1)
+    )
+    return jnp.diff(grid)
+
+
+def densities(
+    osc: Oscillator, n: int, codes: Array, y: Array, duration: Array, slips: Array
+) -> Array:
+    """The density of steps at the ends of n coarse steps along an arc that slips, [n + 1].
+
+    Clipped: where a guess is poor the mesh is only less good.
+    """
 
     def march():
         def advance(y, _):
@@ -129,16 +145,9 @@ def _mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) 
 
         return lax.scan(advance, y, None, length=n)[1]
 
-    # Stick phases, and the padding of a chain, take no steps.
-    rest = lax.cond(any_lane(duration != 0), march, lambda: jnp.ones(n))
+    rest = lax.cond(any_lane(slips), march, lambda: jnp.ones(n))
     rho = jnp.concatenate([density(osc, mode_of(codes), *y)[None], rest])
-    # Clipped: where a guess is poor the mesh is only less good.
-    rho = jnp.clip(jnp.nan_to_num(rho, nan=1.0), 1.0, 100.0)
-    share = jnp.concatenate([jnp.zeros(1), jnp.cumsum(rho[1:] + rho[:-1])])
-    grid = jnp.interp(
-        jnp.linspace(0.0, 1.0, steps + 1), share / share[-1], jnp.linspace(0, 1, n + 1)
-    )
-    return jnp.diff(grid)
+    return jnp.clip(jnp.nan_to_num(rho, nan=1.0), 1.0, 100.0)
 
 
 def _marched_mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) -> Array:
@@ -505,9 +514,8 @@ def solve_closed(osc: Oscillator, chain: Chain, guess: Array) -> tuple[Array, Ar
     start = _with_ends(backwards, guess)
     solved = solve(ClosedChain(chain, backwards), osc, start)
     z = _with_entries(osc, chain, backwards, solved.z)
-    sticks = jnp.any(chain.used[:, None] & (chain.codes == 0))
     off = jnp.maximum(solved.unsettled, jnp.max(solved.rounding.reshape(-1, 3)[:, :2]))
-    return z, solved.iterations, jnp.where(sticks, 0.0, off)
+    return z, solved.iterations, jnp.where(chain.sticks, 0.0, off)
 
 
 def closed(osc: Oscillator, chain: Chain, z: Array) -> Array:

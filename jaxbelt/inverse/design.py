@@ -19,9 +19,8 @@ from ..activity import announced
 from ..bifurcations.base import AbstractCondition, check_conditions
 from ..bifurcations.refine import refine
 from ..checks import (
-    as_array,
+    as_finite,
     as_numbers,
-    check_finite,
     outside_of_traces,
     require,
     require_callable,
@@ -207,8 +206,7 @@ def design(
         ValueError: If an argument is impossible; the message names it.
     """
     check_oscillator(oscillator, "oscillator")
-    y0 = as_array(y0, "y0", (2,))
-    check_finite(y0, "y0")
+    y0 = as_finite(y0, "y0", (2,))
     functionals, intervals = _checked_targets(targets)
     for functional in functionals:
         _check_functional(functional, oscillator)

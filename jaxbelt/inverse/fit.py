@@ -32,7 +32,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
-from ..checks import as_array, as_whole, check_finite, outside_of_traces, require, require_value
+from ..checks import as_array, as_finite, as_whole, outside_of_traces, require, require_value
 from ..model.oscillator import Oscillator, check_oscillator
 from ..model.own_units import own_length, quantity, rescaled
 from ..results import Status, describe, draw
@@ -318,8 +318,7 @@ def fit(
 
 
 def _checked_record(ts, x1, x2, noise):
-    times = np.asarray(as_array(ts, "ts", (None,)))
-    check_finite(times, "ts")
+    times = np.asarray(as_finite(ts, "ts", (None,)))
     require(len(times) >= 8, "ts", "at least 8 times", len(times))
     require_value(np.all(np.diff(times) > 0), "ts", "increasing", times)
     require(x1 is not None or x2 is not None, "x1", "given, or x2", None)

@@ -19,7 +19,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..model.forcing import AbstractForce, BaseMotion, ConstantForce, Harmonic, Oscillating
+from ..model.forcing import (
+    AbstractForce,
+    BaseMotion,
+    ConstantForce,
+    Harmonic,
+    Oscillating,
+    unchecked,
+)
 from ..model.modes import Mode, foremost
 from ..model.oscillator import Belt, MovingBelt, Oscillator
 from .lanes import materialise
@@ -176,10 +183,9 @@ class StepClock(NamedTuple):
             pushes.append(materialise(force.on_mass(time, self.osc.damping), self.ones))
         rows = zip(self.osc.belts, self.velocities, self.loads, strict=True)
         belts = tuple(_belt(belt, v, load, c) for belt, v, load in rows)
-        forcing = tuple(
-            _wave_unchecked(ConstantForce, amplitude=push, phase=None) for push in pushes
-        )
-        return _wave_unchecked(Oscillator, **vars(self.osc) | dict(belts=belts, forcing=forcing))
+        forcing = tuple(unchecked(ConstantForce, amplitude=push, phase=None) for push in pushes)
+        damping, omega = self.osc.damping, self.osc.omega
+        return unchecked(Oscillator, damping=damping, belts=belts, omega=omega, forcing=forcing)
 
     def carried(self, mode: Mode, x1: Array, c: float) -> tuple[Array, Array]:
         """The state (x1, x2) at the part c of the step of a mass that sticks."""
@@ -189,14 +195,10 @@ class StepClock(NamedTuple):
             return x1 + ways[0] / self.osc.omega, speeds[0] / self.osc.omega
         rows = [jnp.broadcast_to(x, x1.shape) for x in (*ways, *speeds)]
         n, zero = len(ways), jnp.zeros_like(x1)
-        way, speed = (
-            foremost(self.osc_at_rest(), mode.stuck, x, zero) for x in (rows[:n], rows[n:])
-        )
+        # In the middle of the step: what does not depend on the time.
+        osc = self.at(0.5)
+        way, speed = (foremost(osc, mode.stuck, x, zero) for x in (rows[:n], rows[n:]))
         return x1 + way / self.osc.omega, speed / self.osc.omega
-
-    def osc_at_rest(self) -> Oscillator:
-        """The oscillator in the middle of the step, for what does not depend on the time."""
-        return self.at(0.5)
 
 
 def _belt(belt: Belt, velocity: Any, load: Any, c: float) -> Belt:
@@ -204,12 +206,4 @@ def _belt(belt: Belt, velocity: Any, load: Any, c: float) -> Belt:
     fields = vars(belt) | dict(velocity=velocity.at(c), load=load.at(c))
     if moves:
         fields["rate"] = velocity.rate(c)
-    return _wave_unchecked(MovingBelt if moves else Belt, **fields)
-
-
-def _wave_unchecked(kind: type, /, **fields: Any) -> Any:
-    made = object.__new__(kind)
-    for name, value in fields.items():
-        if name != "units":
-            object.__setattr__(made, name, value)
-    return made
+    return unchecked(MovingBelt if moves else Belt, **fields)

@@ -163,7 +163,7 @@ class ConstantForce(AbstractForce):
         return jnp.abs(self.push)
 
     def in_units_of(self, force: ArrayLike, length: ArrayLike, time: ArrayLike) -> AbstractForce:
-        return _made(ConstantForce, amplitude=self.amplitude / force, phase=self.phase)
+        return unchecked(ConstantForce, amplitude=self.amplitude / force, phase=self.phase)
 
     def __repr__(self) -> str:
         phase = "" if self.phase is None else f", phase={number(self.phase)}"
@@ -178,7 +178,7 @@ class ConstantShift(ConstantForce):
     wave: ClassVar[str] = "BaseMotion"
 
     def in_units_of(self, force: ArrayLike, length: ArrayLike, time: ArrayLike) -> AbstractForce:
-        return _made(ConstantShift, amplitude=self.amplitude / length, phase=self.phase)
+        return unchecked(ConstantShift, amplitude=self.amplitude / length, phase=self.phase)
 
 
 class _Sinusoid(AbstractForce):
@@ -217,7 +217,7 @@ class Harmonic(_Sinusoid):
 
     def in_units_of(self, force: ArrayLike, length: ArrayLike, time: ArrayLike) -> AbstractForce:
         amplitude, frequency = self.amplitude / force, self.frequency * time
-        return _made(Harmonic, amplitude=amplitude, frequency=frequency, phase=self.phase)
+        return unchecked(Harmonic, amplitude=amplitude, frequency=frequency, phase=self.phase)
 
 
 class BaseMotion(_Sinusoid):
@@ -254,7 +254,7 @@ class BaseMotion(_Sinusoid):
 
     def in_units_of(self, force: ArrayLike, length: ArrayLike, time: ArrayLike) -> AbstractForce:
         amplitude, frequency = self.amplitude / length, self.frequency * time
-        return _made(BaseMotion, amplitude=amplitude, frequency=frequency, phase=self.phase)
+        return unchecked(BaseMotion, amplitude=amplitude, frequency=frequency, phase=self.phase)
 
 
 class Oscillating(_Wave):
@@ -302,7 +302,7 @@ class Oscillating(_Wave):
         """The same wave where these are the units of the value and of time."""
         mean, amplitude, frequency = self.mean / unit, self.amplitude / unit, self.frequency * time
         fields = dict(mean=mean, amplitude=amplitude, frequency=frequency, phase=self.phase)
-        return _made(Oscillating, **fields)
+        return unchecked(Oscillating, **fields)
 
     def rules_as(self, field: str) -> list[Rule]:
         """Its rules as a part of a belt; a load is never negative."""
@@ -318,7 +318,7 @@ def _is_never_negative(mean: Any, amplitude: Any) -> Any:
     return mean >= abs(amplitude)
 
 
-def _made(kind: type, /, **fields: Any) -> Any:
+def unchecked(kind: type, /, **fields: Any) -> Any:
     """A module without the checks of its numbers, which those of the user have passed."""
     made = object.__new__(kind)
     for name, value in fields.items():
@@ -379,7 +379,7 @@ def _without_frequency(force: AbstractForce) -> AbstractForce:
         return force
     phase = None if _is_zero(force.phase) else force.phase
     kind = ConstantShift if isinstance(force, BaseMotion) else ConstantForce
-    return _made(kind, amplitude=force.amplitude, phase=phase)
+    return unchecked(kind, amplitude=force.amplitude, phase=phase)
 
 
 #: Users' forces whose `force` was traced.

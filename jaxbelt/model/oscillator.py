@@ -53,7 +53,15 @@ from ..checks import (
 )
 from ..dimensions import quantity
 from ..numerics.compiling import traced_once
-from .forcing import AbstractForce, ConstantForce, Oscillating, as_forcing, as_load, as_velocity
+from .forcing import (
+    AbstractForce,
+    ConstantForce,
+    Oscillating,
+    as_forcing,
+    as_load,
+    as_velocity,
+    unchecked,
+)
 from .friction import AbstractFriction, as_friction
 
 
@@ -314,28 +322,18 @@ def at_time(osc: Oscillator, t: Array) -> Oscillator:
     total = functools.reduce(
         operator.add, [force.on_mass(t, osc.damping) for force in osc.forcing], jnp.zeros_like(t)
     )
-    force, still = object.__new__(ConstantForce), object.__new__(Oscillator)
-    object.__setattr__(force, "amplitude", total)
-    object.__setattr__(force, "phase", None)
+    force = unchecked(ConstantForce, amplitude=total, phase=None)
     belts = tuple(_belt_at(belt, t) for belt in osc.belts)
     fields = dict(damping=osc.damping, belts=belts, omega=osc.omega, forcing=(force,))
-    for name, value in fields.items():
-        object.__setattr__(still, name, value)
-    return still
+    return unchecked(Oscillator, **fields)
 
 
 def _belt_at(belt: Belt, t: Array) -> Belt:
     moves = isinstance(belt.velocity, Oscillating)
-    made = object.__new__(MovingBelt if moves else Belt)
-    fields = vars(belt) | {
-        "velocity": wave_at(belt.velocity, t),
-        "load": wave_at(belt.load, t),
-    }
+    fields = vars(belt) | dict(velocity=wave_at(belt.velocity, t), load=wave_at(belt.load, t))
     if moves:
         fields["rate"] = belt.velocity.rate(t)
-    for name, value in fields.items():
-        object.__setattr__(made, name, value)
-    return made
+    return unchecked(MovingBelt if moves else Belt, **fields)
 
 
 def constant_force(osc: Oscillator) -> list[Array]:

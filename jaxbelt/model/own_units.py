@@ -30,7 +30,7 @@ from jaxtyping import Array
 from ..checks import is_concrete
 from ..dimensions import POWERS
 from ..dimensions import quantity as quantity
-from .forcing import Oscillating
+from .forcing import Oscillating, unchecked
 from .oscillator import Belt, NoEdge, Oscillator, has_edges, scaled_edge
 
 #: Contact edges cut the motion off where a belt could pull the mass farther than this many times
@@ -145,13 +145,13 @@ def in_own_units(osc: Oscillator, unit: Any = None, *, edges: bool | None = None
     omega: Any = np.asarray(osc.omega) if known else osc.omega
     edges = has_edges(osc) if edges is None else edges
     if known and bool(length == 1) and bool(omega == 1):
-        own = _unchecked(OwnOscillator, **vars(osc), units=_units_of_one())
+        own = unchecked(OwnOscillator, **vars(osc), units=_units_of_one())
         return own if edges else without_edges(own)
     velocity = omega * length
     units = _known_units(length, velocity) if known else OwnUnits(jnp.asarray(length), velocity)
     fields = dict(damping=osc.damping, belts=_scaled(osc.belts, units), omega=jnp.ones(()))
     forcing = _scaled_forces(osc.forcing, units)
-    own = _unchecked(OwnOscillator, **fields, forcing=forcing, units=units)
+    own = unchecked(OwnOscillator, **fields, forcing=forcing, units=units)
     return own if edges else without_edges(own)
 
 
@@ -164,7 +164,7 @@ def in_units_of_run(osc: Oscillator, *, edges: bool | None = None) -> OwnOscilla
     own = in_own_units(osc, edges=edges)
     if own is not osc:
         return own
-    return _unchecked(OwnOscillator, **vars(own) | dict(units=_units_of_one()))
+    return unchecked(OwnOscillator, **vars(own) | dict(units=_units_of_one()))
 
 
 AnyOscillator = TypeVar("AnyOscillator", bound=Oscillator)
@@ -176,8 +176,8 @@ def without_edges(osc: AnyOscillator) -> AnyOscillator:
     """The oscillator whose belts touch the mass everywhere, known in every trace, see `NoEdge`."""
     if all(isinstance(belt.lower, NoEdge) for belt in osc.belts):
         return osc
-    belts = tuple(_unchecked(type(belt), **vars(belt) | NO_EDGES) for belt in osc.belts)
-    return _unchecked(type(osc), **vars(osc) | dict(belts=belts))
+    belts = tuple(unchecked(type(belt), **vars(belt) | NO_EDGES) for belt in osc.belts)
+    return unchecked(type(osc), **vars(osc) | dict(belts=belts))
 
 
 def _with_leaves(belts: tuple[Belt, ...]) -> tuple[Belt, ...]:
@@ -187,7 +187,7 @@ def _with_leaves(belts: tuple[Belt, ...]) -> tuple[Belt, ...]:
     with jax.ensure_compile_time_eval():
         bounds = {name: jnp.asarray(np.float64(edge)) for name, edge in NO_EDGES.items()}
     return tuple(
-        _unchecked(type(belt), **vars(belt) | bounds) if isinstance(belt.lower, NoEdge) else belt
+        unchecked(type(belt), **vars(belt) | bounds) if isinstance(belt.lower, NoEdge) else belt
         for belt in belts
     )
 
@@ -210,7 +210,7 @@ def in_units(value: Any, unit: Any, default: float) -> Any:
 
 def _scaled(belts: tuple[Belt, ...], units: OwnUnits) -> tuple[Belt, ...]:
     return tuple(
-        _unchecked(
+        unchecked(
             Belt,
             velocity=in_unit(belt.velocity, units.velocity),
             friction=belt.friction.in_units_of(units.velocity),
@@ -229,14 +229,6 @@ def in_unit(wave: Any, unit: Any, time: Any = 1.0) -> Any:
 
 def _scaled_forces(forcing: tuple[Any, ...], units: OwnUnits) -> tuple[Any, ...]:
     return tuple(force.in_units_of(units.length, units.length, 1.0) for force in forcing)
-
-
-def _unchecked(kind: type, /, **fields: Any) -> Any:
-    """A module without the checks of its numbers, which those of the user have passed."""
-    made = object.__new__(kind)
-    for name, value in fields.items():
-        object.__setattr__(made, name, value)
-    return made
 
 
 # --- results ------------------------------------------------------------------------------------
@@ -270,7 +262,7 @@ def rescaled(
                     changed = old if is_one else rescaled_quantity(old, length, dimensions)
                 if changed is not old:
                     new[name] = changed
-            return _unchecked(type(value), **{**vars(value), **new}) if new else value
+            return unchecked(type(value), **{**vars(value), **new}) if new else value
         if type(value) in (tuple, list):
             return type(value)(map(walked, value))
         if type(value) is dict:
@@ -313,9 +305,9 @@ def in_units_of_user(own: Oscillator) -> Oscillator:
     units = own.units
     if units.is_given:
         fields = {name: value for name, value in vars(own).items() if name != "units"}
-        return _unchecked(Oscillator, **fields | dict(belts=_with_leaves(own.belts)))
+        return unchecked(Oscillator, **fields | dict(belts=_with_leaves(own.belts)))
     back = OwnUnits(1 / units.length, 1 / units.velocity)
     belts, forcing = _scaled(_with_leaves(own.belts), back), _scaled_forces(own.forcing, back)
     omega = units.velocity / units.length
     fields = dict(damping=own.damping, belts=belts, omega=omega, forcing=forcing)
-    return _unchecked(Oscillator, **fields)
+    return unchecked(Oscillator, **fields)

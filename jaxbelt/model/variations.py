@@ -398,6 +398,13 @@ class Variation:
         units = pack.stack(units)
         return replace(own.measured_in(units), units=UnitsOfVariation(self, length, units, edges))
 
+    def over(self, first: float, last: float) -> "Variation":
+        """`in_own_units` between two values of the one parameter; a `ValueError` where the
+        oscillator at one of them is impossible."""
+        for value in (first, last):
+            self.check(value)
+        return self.in_own_units(*np.array([[0.5 * (first + last)], [first], [last]]))
+
     def _may_have_edges(self, values: Any) -> bool:
         """Whether any of the oscillators may have a contact edge; values: possible ones, [k]."""
         if self.line is not None:
@@ -509,8 +516,11 @@ def _varies_omega(line: Family) -> bool:
     return not is_concrete(slopes.omega) or bool(np.any(slopes.omega))
 
 
-def as_span(span: Any, where: Any) -> tuple[float, float]:
-    """The span of a parameter, or a `ValueError`: also where it stands in the place of `where`."""
+def as_span(osc: Any, where: Any, span: Any) -> tuple[float, float]:
+    """The span of a parameter, or a `ValueError`, of `where` first: where this is left out, the
+    span stands in its place."""
+    if isinstance(osc, Oscillator):
+        leaf_index(osc, where)
     numbers = isinstance(where, tuple | list | np.ndarray) and len(where) == 2
     if span is None and numbers and not any(map(callable, where)):
         first, last = where

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from ..checks import as_array, check_finite, require
+from ..checks import as_finite, require
 from .compiling import jit
 from .newton import newton
 
@@ -82,10 +82,8 @@ def continue_curve(
     The last point says why it is the last. Where Newton's method fails at the start there is no
     point. `ValueError` names an impossible argument.
     """
-    u0 = as_array(start, "start", (None,))
-    check_finite(u0, "start")
-    way = as_array(direction, "direction", u0.shape)
-    check_finite(way, "direction")
+    u0 = as_finite(start, "start", (None,))
+    way = as_finite(direction, "direction", u0.shape)
     require(np.any(np.asarray(way) != 0), "direction", "not zero", way)
     steps = (min_step, step, max_step)
     ordered = 0 < min_step <= step <= max_step

@@ -19,11 +19,10 @@ from jaxtyping import Array, ArrayLike
 
 from ..activity import Activity, announced, note_progress
 from ..checks import (
-    as_array,
+    as_finite,
     as_interval,
     as_positive,
     as_whole,
-    check_finite,
     outside_of_traces,
     refuse_interval,
     require,
@@ -397,8 +396,7 @@ def _labelled(
 def _starts_along(values: Any, name: str) -> np.ndarray:
     """Checks the starts along one axis."""
     refuse_interval(values, name)
-    along = np.asarray(as_array(values, name, (None,)))
-    check_finite(along, name)
+    along = np.asarray(as_finite(values, name, (None,)))
     require(along.size > 0, name, "one value or more", "none")
     require_value(np.all(np.diff(along) > 0), name, "increasing", along)
     return along

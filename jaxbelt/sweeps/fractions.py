@@ -26,7 +26,6 @@ from ..dimensions import EXTENT
 from ..model.equilibria import equilibria
 from ..model.oscillator import Oscillator, refuse_clock
 from ..model.own_units import quantity, rescaled
-from ..model.parameters import leaf_index
 from ..model.variations import Variation, as_span, varied
 from ..numerics.spacing import evenly_spaced
 from ..results import Status, draw
@@ -204,9 +203,7 @@ def basin_fractions(
     Raises:
         ValueError: If an argument is impossible; the message names it.
     """
-    if isinstance(osc, Oscillator):
-        leaf_index(osc, where)
-    first, last = as_span(span, where)
+    first, last = as_span(osc, where, span)
     corners, n, rows = as_box(box), as_whole(n, "n"), as_whole(rows, "rows", 2)
     check_key(key)
     numbers = settings_of_runs(t1, rtol, atol)
@@ -214,12 +211,10 @@ def basin_fractions(
     given = varied(osc, where, (first,))
     instead = "jb.sweep with axes x1 and x2"
     refuse_clock(given.oscillator(np.array([first])), "basin_fractions", instead)
-    for value in (first, last):
-        given.check(value)
+    # The runs are those in own units.
+    variation = given.over(first, last)
     values = evenly_spaced(first, last, rows)
     starts = [starts_in(corners, n, jax.random.fold_in(key, row)) for row in range(rows)]
-    # From here on in own units.
-    variation = given.in_own_units(*np.array([[0.5 * (first + last)], [first], [last]]))
     length, (unit,) = variation.own.length, variation.own.parameters
     if numbers["atol"] is not None:
         numbers["atol"] /= float(length)

@@ -10,8 +10,8 @@ import numpy as np
 
 from ..checks import (
     as_array,
+    as_finite,
     check_arguments,
-    check_finite,
     is_concrete,
     require,
     require_callable,
@@ -54,8 +54,7 @@ class Grid:
         }
         for name, values in self.axes.items():
             require(values.size > 0, f"axis {name}", "at least one value", "none")
-        start = as_array(y0, "y0", (2,))
-        check_finite(start, "y0")
+        start = as_finite(y0, "y0", (2,))
         self.y0 = dict(zip(("x1", "x2"), np.asarray(start).tolist(), strict=True))
         self.shape = tuple(values.size for values in self.axes.values())
         self.runs = math.prod(self.shape)

@@ -22,19 +22,17 @@ from jaxtyping import ArrayLike
 
 from ..activity import announced, note_progress
 from ..checks import (
-    as_array,
+    as_finite,
     as_interval,
     as_positive,
     as_tolerance,
     as_whole,
-    check_finite,
     outside_of_traces,
     require_one_of,
     require_value,
 )
 from ..cycles.attractors import RUN
 from ..model.oscillator import Oscillator, frequencies, has_clock
-from ..model.parameters import leaf_index
 from ..model.variations import Variation, as_span, varied
 from ..numerics.spacing import evenly_spaced
 from ..results import Status, draw
@@ -207,9 +205,7 @@ def orbit_diagram(
     Raises:
         ValueError: If an argument is impossible; the message names it.
     """
-    if isinstance(osc, Oscillator):
-        leaf_index(osc, where)
-    first, last = as_span(span, where)
+    first, last = as_span(osc, where, span)
     starts = _starts_of(y0)
     numbers = {"rtol": as_positive(rtol, "rtol"), "atol": as_tolerance(atol, "atol")}
     variation = varied(osc, where, (first,), forced=True)
@@ -238,8 +234,7 @@ def _starts_of(y0: Any) -> np.ndarray:
         are_several = np.ndim(y0) == 2
     except ValueError:  # rows of different lengths; the check below raises
         are_several = False
-    starts = np.asarray(as_array(y0, "y0", (None, 2) if are_several else (2,)))
-    check_finite(starts, "y0")
+    starts = np.asarray(as_finite(y0, "y0", (None, 2) if are_several else (2,)))
     require_value(starts.size, "y0", "one start or more", y0)
     return starts.reshape(-1, 2)
 
