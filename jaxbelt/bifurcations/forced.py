@@ -150,6 +150,10 @@ class AbstractForcedCondition(AbstractCondition):
     def with_clock(self):
         return self
 
+    def kind_along(self, osc, multiplier) -> type[AbstractCondition]:
+        # Conditions that are there without a clock, too, have a class of their own here.
+        return getattr(self, "public", type(self))
+
     def beginnings_of(
         self, osc: Oscillator, motion: PeriodicMotion, known: bool = False
     ) -> Iterator[Beginning]:
@@ -351,9 +355,6 @@ class TimedGrazing(AbstractForcedCondition):
     belt: int
     public: type[AbstractCondition] = eqx.field(static=True)
 
-    def kind_along(self, osc, multiplier) -> type[AbstractCondition]:
-        return self.public
-
     def beginnings_of(self, osc, motion, known=False):
         rows, k = ArcRows.of(motion), int(self.belt)
         names = Ends(rows.codes.shape[1])
@@ -454,9 +455,6 @@ class TimedCrossing(_AtArrival):
     public: type[AbstractCondition] = eqx.field(static=True)
 
     rises: ClassVar[float] = 1.0
-
-    def kind_along(self, osc, multiplier) -> type[AbstractCondition]:
-        return self.public
 
 
 class SwitchingSliding(_AtArrival):

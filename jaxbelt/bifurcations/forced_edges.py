@@ -41,9 +41,6 @@ class AbstractTimedEdge(AbstractForcedCondition):
     belt: int
     public: type[AbstractCondition] = eqx.field(static=True)
 
-    def kind_along(self, osc, multiplier) -> type[AbstractCondition]:
-        return self.public
-
     def ends_of_edges(self, osc: Oscillator) -> Iterator[tuple[int, np.ndarray]]:
         """Of each edge of the belt, of a known oscillator, its number in `Ends`, and those of all
         edges at the same place."""
