@@ -273,3 +273,27 @@ def test_a_parameter_that_rises_and_falls_keeps_its_attractor():
         assert np.array_equal(one.period[:, 0], both.period[:, start], equal_nan=True)
     labels = [line.get_label() for line in both.plot().lines]
     assert "cycle, parameter falling" in labels
+
+
+@pytest.mark.slow
+def test_runs_go_on_where_others_have_come_to_whatever_the_phase_and_the_first_force():
+    """Chaos is followed while the frequency falls, below 1.683, too, where the motion that sticks is
+    while it rises."""
+
+    def forced(*ratios):
+        def make(frequency):
+            law = jb.Cubic(1.5, 1.5, 0.45)
+            forcing = tuple(jb.Harmonic(0.1 * (one == 1), one * frequency) for one in ratios)
+            return jb.Oscillator(0.0, (jb.Belt(1.0, law),), forcing=forcing)
+
+        return make
+
+    def periodic_rows(make, phase):
+        options = dict(span=(1.675, 1.695), rows=11, y0=(0.5, 0.0), sense="both")
+        found = jb.orbit_diagram(make, at=jb.AtPhase(phase), **options)
+        return np.sum(np.isfinite(found.period), axis=0).tolist()
+
+    rising, falling = periodic_rows(forced(1), 0.0)
+    assert falling < rising
+    for ratios, phase in (((1,), 1.5), ((1,), -1.0), ((1, 2), 0.0), ((2, 1), 0.0), ((0.5, 1), 0.0)):
+        assert periodic_rows(forced(*ratios), phase) == [rising, falling]

@@ -44,7 +44,7 @@ class AbstractTimedEdge(AbstractForcedCondition):
     def ends_of_edges(self, osc: Oscillator) -> Iterator[tuple[int, np.ndarray]]:
         """Of each edge of the belt, of a known oscillator, its number in `Ends`, and those of all
         edges at the same place."""
-        n, places = len(osc.belts), _places(osc)
+        n, places = len(osc.belts), _edge_places(osc)
         for edge in (self.belt, n + self.belt):
             if np.isfinite(places[edge]):
                 yield n + edge, n + np.flatnonzero(places == places[edge])
@@ -67,7 +67,7 @@ class TimedEdgeGrazing(AbstractTimedEdge):
         for edge, same in self.ends_of_edges(osc):
             if known:
                 for row in np.flatnonzero(rows.ends == names.extremum_x1).tolist():
-                    yield _both(rows, _from_edge(osc, rows, row, edge), row, edge)
+                    yield _both(rows, _off_edge(osc, rows, row, edge), row, edge)
                 continue
             short = [r for r in range(1, len(rows.ends) - 1) if _is_excursion(rows, r, same)]
             for shorter, row, value in without_one_of(rows, short, names.extremum_x1):
@@ -87,7 +87,7 @@ class TimedCorner(AbstractTimedEdge):
         for edge, same in self.ends_of_edges(osc):
             for row, end in enumerate(rows.ends[:-1].tolist()):
                 if end < n or end == onset:
-                    yield _both(rows, _from_edge(osc, rows, row, edge), row, edge)
+                    yield _both(rows, _off_edge(osc, rows, row, edge), row, edge)
                 elif end in same:
                     y = jnp.asarray(rows.z[row + 1, :3])
                     before, after = rows.codes[row : row + 2]
@@ -108,9 +108,9 @@ class TimedCorner(AbstractTimedEdge):
             yield from ((before, belt) for belt in np.flatnonzero(touched).tolist())
 
 
-def _from_edge(osc: Oscillator, rows: ArcRows, row: int, end: int) -> float:
+def _off_edge(osc: Oscillator, rows: ArcRows, row: int, end: int) -> float:
     """How far from an edge an arc ends."""
-    return abs(_places(osc)[end - len(osc.belts)] - rows.z[row + 1, 0])
+    return abs(_edge_places(osc)[end - len(osc.belts)] - rows.z[row + 1, 0])
 
 
 def _is_excursion(rows: ArcRows, row: int, ends: np.ndarray) -> bool:
@@ -119,10 +119,10 @@ def _is_excursion(rows: ArcRows, row: int, ends: np.ndarray) -> bool:
     return bool(passes and np.array_equal(rows.codes[row - 1], rows.codes[row + 1]))
 
 
-def _places(osc: Oscillator) -> np.ndarray:
+def _edge_places(osc: Oscillator) -> np.ndarray:
     return np.array([float(place) for place in edges(osc)])
 
 
 def edged_belts(osc: Oscillator) -> list[int]:
     """The numbers of the belts that have a contact edge, of a known oscillator."""
-    return np.flatnonzero(np.any(np.isfinite(_places(osc).reshape(2, -1)), axis=0)).tolist()
+    return np.flatnonzero(np.any(np.isfinite(_edge_places(osc).reshape(2, -1)), axis=0)).tolist()

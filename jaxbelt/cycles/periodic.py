@@ -72,6 +72,8 @@ SAME_STATE, SAME_OF_MOTION = 1e-7, 1e-6
 AT_PHASE_0 = 1e-4
 #: How far from events a chain has to begin, over the longest time between two of them.
 OFF_EVENTS = 0.25
+#: Multipliers are known to this: nearer to the unit circle they may be on it, as without damping.
+ON_THE_CIRCLE = 1e-9
 #: Newton steps on the state at phase 0 where the arcs that were followed are not those sought.
 OUTER_STEPS = 12
 
@@ -151,8 +153,8 @@ class PeriodicMotion(ClosedMotion):
 
     @property
     def stable(self) -> Array:
-        """Whether both multipliers are inside of the unit circle."""
-        return jnp.all(jnp.abs(self.multipliers) < 1, axis=-1)
+        """Whether both multipliers are inside of the unit circle, and not on it up to rounding."""
+        return jnp.all(jnp.abs(self.multipliers) < 1 - ON_THE_CIRCLE, axis=-1)
 
     def at(self, osc: Oscillator) -> "PeriodicMotion":
         """The motion with the same signature of another oscillator, near to its own.

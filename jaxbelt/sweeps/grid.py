@@ -97,21 +97,23 @@ class Grid:
         jax.vmap(probe, axis_size=2, out_axes=None)({name: np.zeros(2) for name in self.names})
         return tuple(found)
 
-    def program(self, observer: Observer) -> Program:
+    def program(self, observer: Observer, *, own_t0: bool = False) -> Program:
         made_of = fingerprint_or_unique((self.structure, observer))
-        return Program(self.structure, self.mapped, observer, self.edges, made_of=made_of)
+        known = self.structure, self.mapped, observer, self.edges
+        return Program(*known, own_t0=own_t0, made_of=made_of)
 
     def results(
         self, observer: Observer, states: np.ndarray, which: np.ndarray, **numbers: Any
     ) -> dict[str, np.ndarray]:
-        """`results_of` runs from states, [2, runs]; which: the runs of the grid whose parameters
-        they have, [runs]."""
+        """`results_of` runs from states (x1, x2) or (x1, x2, t), [2 or 3, runs]; which: the runs of
+        the grid whose parameters they have, [runs]."""
 
         def rows_of(first: int, last: int) -> np.ndarray:
             rows = self.rows(which[first:last])
             return np.concatenate([states[None, :, first:last], rows[:, 2:]], axis=1)
 
-        return results_of(self.program(observer), self.shared, rows_of, len(which), **numbers)
+        program = self.program(observer, own_t0=len(states) == 3)
+        return results_of(program, self.shared, rows_of, len(which), **numbers)
 
     def length(self) -> float:
         """Smallest own unit of length among a sample of the oscillators of the grid."""

@@ -43,7 +43,7 @@ from .grid import Grid
 from .moments import AtEvents, AtExtrema, AtPhase, AtSection
 from .question import LONG_ENOUGH
 from .reducers import check_sections
-from .strobes import SAME
+from .strobes import SAME, common_turns
 
 if TYPE_CHECKING:
     import pandas
@@ -301,15 +301,22 @@ class Sampling:
 
     def _strobed(self, grid: Grid, values: np.ndarray) -> OrbitDiagram:
         """The diagram of a stroboscopic section: STROBES points behind PERIODS_LEFT_OUT periods."""
-        first = [float(frequencies(self._make(value))[0]) for value in values]
-        period = 2 * np.pi / np.repeat(first, len(self.starts))
+        runs = [self._make(value) for value in values for _ in self.starts]
+        period = 2 * np.pi / np.array([float(frequencies(osc)[0]) for osc in runs])
         left_out = PERIODS_LEFT_OUT_BESIDE if self.senses else PERIODS_LEFT_OUT
-        t1 = float(np.max(period)) * (left_out + STROBES + 1)
         reducer = _KeptMoments((self.at,), STROBES, ("x1", "x2"), left_out)
         off = OFF_ATTRACTOR * grid.length()
+        # Where all waves together have a period, runs go on at the time in it that others came to.
+        turns = np.array([max(1, int(common_turns(osc, jnp.zeros((), int)))) for osc in runs])
+        t1 = float(np.max(period)) * (left_out + STROBES + int(np.max(turns)) + 1)
+        passed = np.zeros(len(runs), int)
+        passed[:] = np.ceil(-self.at.phase / (2 * np.pi) - 1e-12)
 
-        def further(found):
-            return reducer.last_state(found) + off
+        def further(found, which, following):
+            *state, last = reducer.last_state(found)
+            passed[following] = (passed[which] + left_out + last) % turns[following]
+            times = (self.at.phase / (2 * np.pi) + passed[following]) * period[following]
+            return np.stack([*(x + off for x in state), times])
 
         found = self._from_starts(grid, Along(reducer), further, t1, t0=0.0)
         x1, x2 = reducer.columns(found)
@@ -347,26 +354,34 @@ class Sampling:
         self,
         grid: Grid,
         observer: Any,
-        further: Callable[[dict[str, np.ndarray]], np.ndarray],
+        further: Callable[[dict[str, np.ndarray], np.ndarray, np.ndarray], np.ndarray],
         t1: float,
         **numbers: Any,
     ) -> dict[str, np.ndarray]:
         """Results of an observer for all runs. Where the parameter changes in some sense,
-        `further` says of results where the next value begins, [2, runs], NaN: where they did."""
+        `further` says of results, and of the numbers of these runs and the following ones, where
+        the latter begin, [2 or 3, runs], see `Grid.results`; NaN: where the former did."""
         if not self.senses:
             states = np.tile(self.starts.T, self.rows)
             return self._results(grid, observer, states, t1, **numbers)
         lanes, found = np.arange(len(self.senses)), {}
+        rows = [
+            np.array([i if sense == "up" else self.rows - 1 - i for sense in self.senses])
+            for i in range(self.rows)
+        ]
+        runs = [row * len(lanes) + lanes for row in rows]
         states = self.starts.T
-        for i in range(self.rows):
+        if isinstance(self.at, AtPhase):  # with the time at which they begin
+            states = np.concatenate([states, np.zeros((1, len(lanes)))])
+        for i, which in enumerate(runs):
             note_progress(f"{i} of {self.rows} values")
-            row = [i if sense == "up" else self.rows - 1 - i for sense in self.senses]
-            which = np.array(row) * len(lanes) + lanes
             few = {"width": LANES_OF_FEW, **numbers}
-            for name, values in self._results(grid, observer, states, t1, which, **few).items():
+            results = self._results(grid, observer, states, t1, which, **few)
+            for name, values in results.items():
                 shape = self.rows * len(lanes), *values.shape[1:]
                 found.setdefault(name, np.full(shape, np.nan))[which] = values
-            ahead = further({name: values[which] for name, values in found.items()})
+            following = runs[min(i + 1, self.rows - 1)]
+            ahead = further(results, which, following)
             states = np.where(np.isfinite(ahead), ahead, states)
         return found
 
@@ -427,11 +442,11 @@ class Sampling:
         return moments, cut
 
 
-def _beside_attractor(grid: Grid) -> Callable[[dict[str, np.ndarray]], np.ndarray]:
+def _beside_attractor(grid: Grid) -> Callable[..., np.ndarray]:
     """Gives a state on the attractor of each run, [2, runs], or beside it, by its results."""
     off = OFF_ATTRACTOR * grid.length()
 
-    def state(found: dict[str, np.ndarray]) -> np.ndarray:
+    def state(found: dict[str, np.ndarray], which: np.ndarray, following: np.ndarray):
         kind = np.nan_to_num(found["kind"]).astype(int)
         is_cycle, rests = kind == CYCLE, kind == EQUILIBRIUM
         x1 = np.where(is_cycle, found["x1_max"], found["x1_min"] + np.where(rests, off, 0.0))
@@ -497,12 +512,12 @@ class _KeptMoments:
             for i, piece in enumerate(pieces)
         }
 
-    def last_state(self, found: dict[str, np.ndarray]) -> np.ndarray:
-        """The last (x1, x2) that was kept of runs, [2, runs], NaN where there is none."""
+    def last_state(self, found: dict[str, np.ndarray]) -> tuple[np.ndarray, ...]:
+        """The last (x1, x2) that was kept of runs, [runs], NaN where there is none, and which of
+        those kept it was."""
         x1, x2 = self.columns(found)
-        known = np.isfinite(x1)
-        last = self.room - 1 - np.argmax(known[:, ::-1], axis=1)
-        return np.stack([np.take_along_axis(x, last[:, None], 1)[:, 0] for x in (x1, x2)])
+        last = self.room - 1 - np.argmax(np.isfinite(x1)[:, ::-1], axis=1)
+        return *(np.take_along_axis(x, last[:, None], 1)[:, 0] for x in (x1, x2)), last
 
     def columns(self, found: dict[str, np.ndarray]) -> list[np.ndarray]:
         """What was kept of runs, [runs, room] each, from their results."""

@@ -19,7 +19,7 @@ from ..cycles.clocked import RATIO_ROUNDING, RATIOS
 from ..cycles.settling import way_left
 from ..kernel.lanes import Lanes, Observer, Variable, choose, materialise
 from ..model.instants import blur
-from ..model.oscillator import frequencies
+from ..model.oscillator import Oscillator, frequencies
 from ..model.own_units import OwnOscillator
 from ..numerics.implicit import step_to_root
 from ..results import Status
@@ -178,7 +178,7 @@ class ForcedAttractor(Observer):
 
     def start(self, osc, lanes):
         zero, count = jnp.zeros_like(lanes.t), jnp.zeros_like(lanes.events)
-        turns = _common_turns(osc, count)
+        turns = common_turns(osc, count)
         passed = jnp.floor(lanes.t / _strobe_period(osc, turns) * (1 + 1e-14) + 1e-12)
         nowhere, never = zero + jnp.nan, jnp.full_like(count, -1)
         patience = count + FIRST_PATIENCE
@@ -415,7 +415,7 @@ class ForcedAttractor(Observer):
         }
 
 
-def _common_turns(osc: OwnOscillator, none: Array) -> Array:
+def common_turns(osc: Oscillator, none: Array) -> Array:
     """As `turns_of`, of each lane, as numbers like `none`, its 0 where there is no such period."""
     first, *others = (jnp.broadcast_to(one, none.shape)[..., None] for one in frequencies(osc))
     turns = jnp.arange(1, RATIOS + 1, dtype=first.dtype).reshape((1,) * none.ndim + (RATIOS,))
