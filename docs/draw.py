@@ -377,9 +377,9 @@ class ForcedCase(NamedTuple):
     start: tuple[float, float]
 
 
-def on_a_belt(nu: float, frequency: float) -> Callable:
+def on_a_belt(nu: float, frequency: float, kinetic: float = 0.6) -> Callable:
     """A mass on one belt, of the amplitude of the force."""
-    law = jb.Coulomb(1.0, 0.6)
+    law = jb.Coulomb(1.0, kinetic)
     return lambda F: jb.Oscillator(0.05, (jb.Belt(nu, law),), forcing=jb.Harmonic(F, frequency))
 
 
@@ -404,7 +404,7 @@ FORCED = {
         *(jb.AddingSliding(0), on_a_belt(0.1, 1.5), "F", 0.95, 0.95, 1.02, (1.0, 0.0)),
     ),
     "SwitchingSliding": ForcedCase(
-        *(jb.SwitchingSliding(0), on_a_belt(0.9, 1.3), "F", 0.9, 0.78, 0.95, (1.0, 0.0)),
+        *(jb.SwitchingSliding(0), on_a_belt(0.9, 1.3, 1.0), "F", 1.0, 0.9, 1.15, (1.0, 0.0)),
     ),
 }
 

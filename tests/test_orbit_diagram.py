@@ -277,8 +277,8 @@ def test_a_parameter_that_rises_and_falls_keeps_its_attractor():
 
 @pytest.mark.slow
 def test_runs_go_on_where_others_have_come_to_whatever_the_phase_and_the_first_force():
-    """Chaos is followed while the frequency falls, below 1.683, too, where the motion that sticks is
-    while it rises."""
+    """Chaos is followed while the frequency falls, also below 1.683, where the motion that sticks
+    is while it rises."""
 
     def forced(*ratios):
         def make(frequency):

@@ -850,3 +850,54 @@ def test_a_point_is_found_again_from_its_own_motion(away):
     value = float(point.value)
     again = jb.refine(jb.AddingSliding(0), osc, at=value + away, start=point.cycle)
     assert int(again.status) == OK and float(again.value) == pytest.approx(value, abs=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("frequency", [0.99, 1.02])
+def test_a_crossing_begins_to_stick_however_long_the_mass_is_beyond(frequency):
+    """It crosses the boundary, slips on the other side for some time, and sticks then; where it
+    crosses it begins to stick for a moment."""
+
+    def osc(frequency, static=0.8, kinetic=0.8):
+        belt = jb.Belt(0.4, jb.Coulomb(static, kinetic))
+        return jb.Oscillator(0.1, (belt,), forcing=jb.Harmonic(0.9, frequency))
+
+    span = (frequency - 0.04, frequency + 0.04)
+    found = jb.bifurcation_diagram(osc, span=span, start=(0.5, 0.0))
+    assert found.open_ends == ()
+    (point,) = found.points
+    assert isinstance(point.condition, jb.CrossingSliding)
+    before, behind = (
+        jb.find_cycle(osc(float(point.value) + way), point.cycle.start).signature
+        for way in (-1e-6, 1e-6)
+    )
+    assert sorted(kind.name for kind, _ in before) == ["CROSS", "SLIP", "STICK"]
+    assert sorted(kind.name for kind, _ in behind) == ["SLIP", "SLIP", "STICK", "STICK"]
+    motion = jb.find_cycle(osc(frequency), (0.5, 0.0))
+    again = jb.refine(jb.CrossingSliding(0), osc, at=frequency, start=motion)
+    assert float(again.value) == pytest.approx(float(point.value), abs=1e-10)
+
+
+@pytest.mark.slow
+def test_where_friction_jumps_two_motions_end_side_by_side():
+    """One sticks where it arrives, the other one crosses, and each ends where it would do what the
+    other one does; in between both are there."""
+
+    def osc(force):
+        belt = jb.Belt(0.9, jb.Coulomb(1.0, 0.6))
+        return jb.Oscillator(0.05, (belt,), forcing=jb.Harmonic(force, 1.3))
+
+    found = jb.bifurcation_diagram(osc, span=(0.7, 0.94))
+    low, high = (float(point.value) for point in found.points)
+    assert {type(point.condition) for point in found.points} == {jb.SwitchingSliding}
+    assert 0.82 < low < high < 0.84
+    for branch in found.branches:
+        kinds = [{kind for kind, _ in cycle.signature} for cycle in branch.cycles]
+        crosses = {jb.EventKind.CROSS in one for one in kinds}
+        assert len(crosses) == 1
+    middle = osc(0.5 * (low + high))
+    durations = {
+        round(float(jb.find_cycle(middle, start).stick_durations[0]), 3)
+        for start in ((-0.3427, 0.6498), (-0.355, 0.659))
+    }
+    assert len(durations) == 2
