@@ -151,12 +151,23 @@ def require_wish(value: Any, field: str) -> None:
     require_value(is_wish, field, "True, False or None", value)
 
 
+#: Largest number of anything that is counted.
+MOST_WHOLE = np.iinfo(np.int32).max
+
+
 def as_whole(value: Any, field: str, least: int = 1) -> int:
-    """`value` as an integer >= `least`, or a `ValueError`."""
+    """`value` as an integer from `least` to MOST_WHOLE, or a `ValueError`."""
     fits = isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= least
     kinds = {0: "an integer >= 0", 1: "a positive integer"}
     require_value(fits, field, kinds.get(least, f"an integer >= {least}"), value)
+    require(value <= MOST_WHOLE, field, f"an integer of at most {MOST_WHOLE}", "a larger one")
     return int(value)
+
+
+def check_no_start(t0: Any) -> None:
+    """Raises unless a time at which runs begin is 0."""
+    is_zero = np.ndim(t0) == 0 and t0 == 0.0
+    require_value(is_zero, "t0", "0 for an oscillator that does not know the time", t0)
 
 
 def as_interval(value: Any, field: str) -> tuple[float, float]:

@@ -211,6 +211,9 @@ def _begun(
         variation = Variation.of_leaves(osc, [number]).in_own_units(lax.stop_gradient(value))
         own = variation.own.of(osc)
         return variation, own, value / variation.own.parameters
+    require_value(
+        where is None, "where", "left out where osc is a function of the parameter", where
+    )
     require(at is not None, "at", "the value of the parameter to begin from", "None")
     at = as_finite(at, "at")
     variation = varied(osc, where, (at,), forced=True)

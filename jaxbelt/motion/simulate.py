@@ -18,9 +18,11 @@ from ..checks import (
     as_numbers,
     as_positive_number,
     as_size,
+    as_whole,
     check_finite,
     is_concrete,
     require,
+    require_one_of,
 )
 from ..model.modes import has_edges
 from ..model.oscillator import (
@@ -378,12 +380,7 @@ def simulate(
     rtol, atol = as_positive_number(rtol, "rtol"), as_size(atol, "atol")
     if ts is not None:
         ts = _checked_times(ts, t0, t1)
-    require(
-        formulation in ("filippov", "switch", "smooth"),
-        "formulation",
-        '"filippov", "switch" or "smooth"',
-        repr(formulation),
-    )
+    require_one_of(formulation, ("filippov", "switch", "smooth"), "formulation")
     for name, width, of in (("v_star", v_star, "switch"), ("eps", eps, "smooth")):
         expected = f'left out unless formulation="{of}"'
         require(width is None or formulation == of, name, expected, width)
@@ -439,12 +436,11 @@ def _budgets(
 
     padded: whether there has to be room for all of them.
     """
-    expected, is_default = "a positive integer", max_segments is None
+    is_default = max_segments is None
     if max_segments is None:
         # Around a pseudo-focus at a contact edge a run has many short arcs.
         max_segments = _room_for((64 if edges else 8) * span, 512)
-    is_count = isinstance(max_segments, int) and max_segments > 0
-    require(is_count, "max_segments", expected, max_segments)
+    max_segments = as_whole(max_segments, "max_segments")
     followed = max_segments
     if is_default and padded and not edges:
         # Padding costs more than the arcs here. No arc is longer than a unit of time; and a loop,
@@ -455,8 +451,7 @@ def _budgets(
     if max_events is None:
         room = _room_for((16 if edges else 4) * span, 64) if padded else max_segments
         max_events = min(max_segments, room)
-    require(isinstance(max_events, int) and max_events > 0, "max_events", expected, max_events)
-    return Rules(max_segments, followed), max_events
+    return Rules(max_segments, followed), as_whole(max_events, "max_events")
 
 
 def _checked_times(ts: ArrayLike | list | tuple, t0: ArrayLike, t1: ArrayLike) -> ArrayLike:

@@ -23,6 +23,7 @@ from ..checks import (
     as_interval,
     as_positive,
     as_whole,
+    check_no_start,
     outside_of_traces,
     refuse_interval,
     require,
@@ -341,7 +342,7 @@ def basins(
     numbers = {"t1": t1, "rtol": rtol, "atol": atol}
     if has_clock(oscillator):
         return _forced_basins(oscillator, axes, progress, numbers | {"t0": t0})
-    require(t0 == 0.0, "t0", "0 for an oscillator that does not know the time", t0)
+    check_no_start(t0)
     with Activity("basins", progress):
         own = in_own_units(oscillator)
         start = jnp.asarray(np.zeros(2))

@@ -224,7 +224,7 @@ def circle_map(
     check_oscillator(osc)
     check_clock(osc, "circle_map", "jb.find_cycle, as sticking cycles have the multiplier 0")
     check_belt(belt, len(osc.belts))
-    fits = limit is None or (limit in (-1, 1) and not isinstance(limit, bool))
+    fits = limit is None or (isinstance(limit, int) and limit in (-1, 1) and limit is not True)
     require_value(fits, "limit", "1, -1 or None", limit)
     n, iterate = as_whole(n, "n", 2), as_whole(iterate, "iterate")
     periods = as_whole(periods, "periods")

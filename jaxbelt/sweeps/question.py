@@ -17,6 +17,7 @@ from ..checks import (
     as_array,
     as_positive,
     as_tolerance,
+    check_no_start,
     in_words,
     is_of_this_package,
     require,
@@ -79,7 +80,7 @@ class Question:
         if clock:
             numbers["t0"] = as_start(t0, numbers["t1"])
         else:
-            require(t0 == 0.0, "t0", "0 for an oscillator that does not know the time", t0)
+            check_no_start(t0)
         wanted: Sequence[str] = [derivatives] if isinstance(derivatives, str) else derivatives
         fits = isinstance(wanted, Sequence)
         require_value(fits, "derivatives", "a tuple of names of axes", wanted)
