@@ -193,7 +193,10 @@ MISTAKES = [
     ("jb.find_cycle(osc, y_0=(3.0, 0.0))", r"find_cycle\(\) takes osc, y0 and .*: y0, not y_0$"),
     ("jb.simulate(osc, (3.0, 0.0), 9.0, formulation=np.ones(2))", "formulation must be .*got "),
     ("jb.simulate(osc, (3.0, 0.0), 9.0, max_segments=10**400)", "max_segments must be .* at most"),
-    ("jb.basins(osc, [0.0, 1.0], [0.0, 1.0], t0=np.ones(2))", "t0 must be 0 for an oscillator"),
+    (
+        "jb.basins(osc, x1=[0.0, 1.0], x2=[0.0, 1.0], t0=np.ones(2))",
+        "t0 must be 0 for an oscillator",
+    ),
     ("jb.circle_map(jb.presets.di_bernardo(1.7), limit=np.ones(2))", "limit must be 1, -1 or None"),
     ("jb.refine(jb.Hopf(), lambda p: osc, where=lambda o: o.damping)", "where must be left out"),
     ("type('L', (jb.Conti,), {'mu': abs})", "L.mu must not replace that of Conti, .*AbstractFri"),

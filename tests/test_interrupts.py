@@ -1,5 +1,6 @@
 """Ctrl-C: every sweep is back at the prompt soon, and says what became of its runs."""
 
+import gc
 import os
 import signal
 import subprocess
@@ -12,7 +13,7 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt.commands.options import GRACE
-from jaxbelt.sweeps import store
+from jaxbelt.sweeps import store, threads
 from jaxbelt.sweeps.datasets import Memory
 from jaxbelt.sweeps.question import Question
 
@@ -166,3 +167,26 @@ def test_interrupts_of_a_session_lose_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(store, "BLOCK_RUNS", kills.BLOCK)
     told = kills.interrupt_campaign(tmp_path, interrupts=3, seed=2, t1=2000.0)
     assert told["interrupted"] == 3 and told["longest"] < SOON
+
+
+def test_an_interrupt_in_a_callback_of_the_garbage_collector_is_not_lost(monkeypatch):
+    """Python would print that it is ignored, and the sweep would go on to its end."""
+    sent = []
+
+    def interrupt_once(phase, info):
+        if not sent:
+            sent.append(phase)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    def collect(*_, **__):
+        # As the main thread does anywhere while it waits.
+        gc.callbacks.append(interrupt_once)
+        gc.collect()
+        gc.callbacks.remove(interrupt_once)
+        return waits(*_, **__)
+
+    waits = threads.wait
+    monkeypatch.setattr(threads, "wait", collect)
+    with pytest.raises(KeyboardInterrupt):
+        jb.sweep(jb.presets.class_b, {"nu0": [0.3], "nu1": [0.2]}, t1=1.0, progress=False)
+    assert sent

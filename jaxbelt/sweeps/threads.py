@@ -132,15 +132,22 @@ def run(
         FIRST_PASSES.here // (1 + derivatives),
     )
     devices = jax.local_devices()
-    # Compiled once, before the threads would each do it; not on the thread of the caller, so that
-    # an interrupt need not wait for it.
-    _wait([_started(team.compile, devices[0])], watch)
-    at_work = [_started(team.work, devices[i % len(devices)]) for i in range(threads)]
-    try:
-        _wait(at_work, watch)
-    finally:
-        team.stop.set()
-        wait(at_work, timeout=10 * PATIENCE)
+    with _noted_interrupts() as raise_interrupt:
+
+        def look():
+            raise_interrupt()
+            watch()
+
+        # Compiled once, before the threads would each do it; not on the thread of the caller, so
+        # that an interrupt need not wait for it.
+        _wait([_started(team.compile, devices[0])], look)
+        at_work = [_started(team.work, devices[i % len(devices)]) for i in range(threads)]
+        try:
+            _wait(at_work, look)
+        finally:
+            team.stop.set()
+            wait(at_work, timeout=10 * PATIENCE)
+        raise_interrupt()
 
 
 def _first_streams(program: Program, shared, width: int, columns: int, derivatives: int) -> Any:
@@ -270,6 +277,30 @@ def _end_of_process() -> None:
         signal.raise_signal(signal.SIGINT)
     for thread in tuple(_alive):
         thread.join()
+
+
+@contextmanager
+def _noted_interrupts() -> Iterator[Callable[[], None]]:
+    """While the block runs an interrupt is only noted, and raised by the function that is given.
+
+    Python raises it wherever the main thread is, and loses it in callbacks of its garbage
+    collector, such as JAX has.
+    """
+    is_usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if not is_usual or threading.current_thread() is not threading.main_thread():
+        yield lambda: None
+        return
+    came = threading.Event()
+
+    def raise_interrupt():
+        if came.is_set():
+            raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, lambda *_: came.set())
+    try:
+        yield raise_interrupt
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _wait(futures: list[Future], watch: Callable[[], None]) -> None:
