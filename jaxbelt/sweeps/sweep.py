@@ -305,6 +305,7 @@ def explain(
     *,
     y0: ArrayLike | tuple = (3.0, 0.0),
     t1: ArrayLike | None = None,
+    t0: ArrayLike = 0.0,
     rtol: ArrayLike = 1e-8,
     atol: ArrayLike | None = None,
     observe: Any = "final",
@@ -320,6 +321,7 @@ def explain(
         axes: As for `sweep`.
         y0: As for `sweep`.
         t1: As for `sweep`.
+        t0: As for `sweep`.
         rtol: As for `sweep`.
         atol: As for `sweep`.
         observe: As for `sweep`.
@@ -331,7 +333,7 @@ def explain(
     Raises:
         ValueError: If an argument is impossible; the message names it.
     """
-    question = Question.of(make, axes, y0, t1, rtol, atol, observe, derivatives)
+    question = Question.of(make, axes, y0, t1, rtol, atol, observe, derivatives, t0)
     grid, table = question.grid, question.table
     sample = np.unique(np.linspace(0, grid.runs - 1, CHUNK.here).astype(int))
 

@@ -7,7 +7,8 @@ motion; differences of its runs say whether the row is stable. Then
 
 - two rows that follow one another have the same events and the same stability, or there is a point
   between them, or the branch turns back;
-- at each point the events or the stability change, or the branch turns back or ends.
+- at each point the events or the stability change, or the branch turns back or ends;
+- from a stable row a run comes to the next one, if that is stable, too, and the branch goes on.
 """
 
 import functools
@@ -31,6 +32,8 @@ STRUCTURES = tuple(
         (("coulomb",), False),
         (("stribeck",), True),
         (("conti", "coulomb"), False),
+        (("conti",), True),
+        (("coulomb", "coulomb"), True),
     )
 )
 #: Rows are the engine's up to this; of unstable ones times their growth.
@@ -39,6 +42,8 @@ SAME = 1e-8
 NEUTRAL = 1e-4
 #: Rows that are asked for.
 ROWS = 48
+#: Periods of the motion after which a run has come to it, and how near.
+SETTLES, SETTLED = 400, 1e-5
 #: Multipliers are differences: of runs that pass the same events.
 GOOD = 1e-3
 
@@ -93,7 +98,16 @@ def outcome(options, number: int) -> Outcome:
             if said.startswith("wrong"):
                 one.wrong.append(f"{said} at {row['value']!r}: {row}\n    {where}")
         for i, (before, after) in enumerate(pairwise(rows)):
-            pairs.append((before, after, _turns(branch.values, i), i in (0, len(rows) - 2)))
+            turns = _turns(branch.values, i)
+            pairs.append((before, after, turns, i in (0, len(rows) - 2)))
+            if before["stable"] and after["stable"] and not turns:
+                here, n = _at(osc, parameter, after["value"]), SETTLES * after["periods"]
+                run = forced_cases.stroboscopic(here, before["start"], n)
+                off = np.max(np.abs(np.subtract(run.y_end, after["start"])))
+                one.counts["next row: " + ("reached" if off < SETTLED else "not reached")] += 1
+                if not off < SETTLED:
+                    ends = f"{before['value']!r} and {after['value']!r}"
+                    one.notes.append(f"off by {off:.1e} between {ends}\n    {where}")
     _compare(one, pairs, found.points, where)
     return one
 
