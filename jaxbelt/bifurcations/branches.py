@@ -333,7 +333,7 @@ def _branch_leg(
             between = _points_between(line, last, MotionRow(float(point.value), point.cycle))
             further = _beyond_point(line, [*behind, *rows], point, tangent[-1])
             return rows, [*points, *between, point], further
-        further = _past_corner(line, last, value, start)
+        further = _past_corner(line, [*behind, *rows], value, start)
         if further is not None:
             return rows, points, (further, float(np.sign(value - last.value)))
     return rows, points, last.value
@@ -438,25 +438,28 @@ def _apart(motion: PeriodicMotion) -> np.ndarray | None:
 
 
 def _past_corner(
-    line: ForcedLine, last: MotionRow, value: float, start: np.ndarray
+    line: ForcedLine, rows: list[MotionRow], value: float, start: np.ndarray
 ) -> MotionRow | None:
     """The motion at a value near to a state at the phase 0, if it is as near to that as the last
-    one, and has nearly its multipliers.
+    row, has nearly its multipliers, and is none that the branch has passed.
 
     Its events may be others: where a mass comes to a contact edge with the velocity of a belt, or
     two belts have one velocity, they change, and the branch goes on.
     """
     if not line.first <= value <= line.last:
         return None
-    motion = periodic_from(line.at(value), start, last.motion.periods, line.turns)
+    osc, last = line.at(value), rows[-1]
+    motion = periodic_from(osc, start, last.motion.periods, line.turns)
     if int(motion.status) != Status.OK or motion.periods != last.motion.periods:
         return None
     found, before = np.asarray(motion.multipliers), np.asarray(last.motion.multipliers)
     alike = np.max(np.abs(found - before)) < ALIKE_MULTIPLIERS * (1 + np.max(np.abs(before)))
     apart = np.max(np.abs(start - np.asarray(last.motion.start)))
     away = np.max(np.abs(np.asarray(motion.start) - start))
+    if not alike or away > apart or _has_passed(rows, value, osc, motion):
+        return None
     row = MotionRow(value, motion)
-    return row if alike and away <= apart and MotionLeg.begun(line, row)[1].found else None
+    return row if MotionLeg.begun(line, row)[1].found else None
 
 
 def _borders(line: ForcedLine, row: MotionRow) -> list[BifurcationPoint]:
@@ -500,7 +503,6 @@ def _beyond_point(
         there = value + side * direction * part * line.length
         if line.first <= there <= line.last:
             osc = line.at(there)
-            passed = [row.motion.at(osc) for row in _rows_beside(rows, there)]
             for stretch in (0.0, part, -part):
                 guess = at + stretch * (at - before)
                 motion = periodic_from(osc, guess, periods, line.turns, share)
@@ -510,17 +512,22 @@ def _beyond_point(
                 row = MotionRow(there, motion)
                 # Beyond the point the signature that has ended may still solve, by rounding.
                 ended = of_one_loop(motion.signature) == of_one_loop(last.motion.signature)
-                same = any(is_same_motion(one, motion) for one in passed)
-                if not (same or (side > 0 and ended)) and MotionLeg.begun(line, row)[1].found:
+                if (side > 0 and ended) or _has_passed(rows, there, osc, motion):
+                    continue
+                if MotionLeg.begun(line, row)[1].found:
                     return row, side * direction
     return None
 
 
-def _rows_beside(rows: list[MotionRow], value: float) -> list[MotionRow]:
-    """The last row, and both rows wherever the branch has passed a value."""
+def _has_passed(
+    rows: list[MotionRow], value: float, osc: OwnOscillator, motion: PeriodicMotion
+) -> bool:
+    """Whether a motion at a value is one of the branch so far: of its last row, or of those beside
+    a place where it has passed the value."""
     pairs = itertools.pairwise(rows)
     beside = [pair for pair in pairs if (pair[0].value - value) * (pair[1].value - value) <= 0]
-    return [rows[-1], *(row for pair in beside for row in pair)]
+    near = [rows[-1], *(row for pair in beside for row in pair)]
+    return any(is_same_motion(row.motion.at(osc), motion) for row in near)
 
 
 def _jumps_at(point: BifurcationPoint) -> bool:

@@ -272,25 +272,26 @@ class Along(Observer):
         seen = replace(seen, sides=tuple(sides))
 
         def pending(state):
-            seen, tables = state
-            due = [jnp.any(self._due(seen, osc, after))]
-            return jnp.any(jnp.stack(due + [jnp.any(jnp.isfinite(_first(t))) for t in tables]))
+            _, tables, due = state
+            flags = [*due, *(jnp.isfinite(_first(table)) for table in tables)]
+            return jnp.any(functools.reduce(jnp.logical_or, flags, jnp.zeros_like(after.done)))
 
+        # What is due is computed once: where it was again, rounded otherwise, the loop did not end.
         def ask(state):
-            seen, tables = state
-            return self._ask_next_held(seen, tables, osc, before, after, holds)
+            seen, tables, due = state
+            seen, tables = self._ask_next_held(seen, tables, due, osc, before, after, holds)
+            return seen, tables, self._due(seen, osc, after)
 
-        return lax.while_loop(pending, ask, (seen, tables))[0]
+        return lax.while_loop(pending, ask, (seen, tables, self._due(seen, osc, after)))[0]
 
-    def _due(self, seen: _Watched, osc: OwnOscillator, after: Lanes) -> Array:
-        """Lanes that have passed a fixed time, also at the start of a run."""
-        late = [
-            times.next_time(osc, passed) <= after.t
+    def _due(self, seen: _Watched, osc: OwnOscillator, after: Lanes) -> list[Array]:
+        """For each of the fixed times the lanes that have passed it, also at the start of a run."""
+        return [
+            (after.run >= 0) & (times.next_time(osc, passed) <= after.t)
             for (_, times), passed in zip(self._times(), seen.passed, strict=True)
         ]
-        return (after.run >= 0) & functools.reduce(jnp.logical_or, late, jnp.zeros_like(after.done))
 
-    def _ask_next_held(self, seen: _Watched, tables, osc, before, after, holds):
+    def _ask_next_held(self, seen: _Watched, tables, dues, osc, before, after, holds):
         """The state after the next moment of each lane, and the tables without that moment."""
         duration = after.t - before.t
         safe = jnp.where(duration > 0, duration, 1.0)
@@ -300,10 +301,8 @@ class Along(Observer):
             number = jnp.where(first < theta, moment, number)
             theta = jnp.minimum(theta, first)
         exact, passed = before.t + jnp.where(jnp.isfinite(theta), theta, 0.0) * duration, []
-        for (moment, times), count in zip(self._times(), seen.passed, strict=True):
-            time = times.next_time(osc, count)
-            due = (after.run >= 0) & (time <= after.t)
-            time = jnp.where(due, time, after.t)
+        for (moment, times), count, due in zip(self._times(), seen.passed, dues, strict=True):
+            time = jnp.where(due, times.next_time(osc, count), after.t)
             earlier = due & ((time - before.t) / safe <= lax.stop_gradient(theta))
             theta = jnp.where(earlier, (time - before.t) / safe, theta)
             exact, number = jnp.where(earlier, time, exact), jnp.where(earlier, moment, number)

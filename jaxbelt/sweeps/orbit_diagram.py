@@ -308,7 +308,8 @@ class Sampling:
         off = OFF_ATTRACTOR * grid.length()
         # Where all waves together have a period, runs go on at the time in it that others came to.
         turns = np.array([max(1, int(common_turns(osc, jnp.zeros((), int)))) for osc in runs])
-        t1 = float(np.max(period)) * (left_out + STROBES + int(np.max(turns)) + 1)
+        # No moment is at t1, where rounding decides whether it counts.
+        t1 = float(np.max(period)) * (left_out + STROBES + int(np.max(turns)) + 0.5)
         passed = np.zeros(len(runs), int)
         passed[:] = np.ceil(-self.at.phase / (2 * np.pi) - 1e-12)
 
