@@ -374,3 +374,28 @@ def test_a_cycle_that_crosses_without_sticking():
     assert dataset.signature.flag_meanings == "cross0-cross0-cross1-cross1"
     # It has converged to 1e-7 of the amplitude when it is accepted.
     np.testing.assert_allclose(dataset.period, run.events[-1].t - run.events[-5].t, rtol=1e-6)
+
+
+def test_impossible_times_are_no_answers_and_harm_no_other_lane():
+    """Known ones raise; traced ones had states from before the start, with the status OK."""
+    osc, nan = jb.presets.class_b(0.45, 0.35), np.nan
+
+    def end(t1, ts, rtol):
+        run = jb.simulate(osc, (3.0, 0.0), t1, ts=ts, rtol=rtol, max_segments=64)
+        return run.ys, run.status
+
+    rows = [
+        (20.0, [1.0, 2.0], 1e-9),
+        (-1.0, [1.0, 2.0], 1e-9),
+        (0.0, [1.0, 2.0], 1e-9),
+        (20.0, [2.0, 1.0], 1e-9),
+        (20.0, [1.0, 30.0], 1e-9),
+        (20.0, [-3.0, 1.0], 1e-9),
+        (20.0, [nan, 1.0], 1e-9),
+        (20.0, [1.0, 2.0], -1.0),
+    ]
+    ys, status = jax.vmap(end)(*(jnp.array(column) for column in zip(*rows)))
+    assert status.tolist() == [jb.Status.OK] + [jb.Status.NOT_FINITE] * 7
+    assert np.all(np.isnan(ys[1:]))
+    alone = jb.simulate(osc, (3.0, 0.0), 20.0, ts=[1.0, 2.0], rtol=1e-9)
+    np.testing.assert_allclose(ys[0], alone.ys, atol=1e-9)

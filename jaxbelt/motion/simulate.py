@@ -385,6 +385,8 @@ def simulate(
         expected = f'left out unless formulation="{of}"'
         require(width is None or formulation == of, name, expected, width)
     padded = not is_concrete((osc, y0, t0, t1, ts, rtol, atol))
+    if padded:
+        y0 = jnp.where(_are_possible(t0, t1, ts, rtol), y0, jnp.nan)
     ends_at_t1 = ts is None or (
         is_concrete((ts, t1)) and np.size(ts) > 0 and bool(np.asarray(ts)[-1] == t1)
     )
@@ -415,6 +417,16 @@ def simulate(
         last=last,
     )
     return _without_padding(trajectory, trim_samples=ts is None, samples=samples)
+
+
+def _are_possible(t0: Any, t1: Any, ts: Any, rtol: Any) -> Array:
+    """Whether traced arguments are such that known ones would not raise."""
+    possible = (t1 > t0) & (jnp.asarray(rtol) > 0)
+    if ts is None:
+        return possible
+    ts, rounding = jnp.asarray(ts), 1e-14 * (jnp.abs(t0) + jnp.abs(t1))
+    inside = jnp.all((ts >= t0 - rounding) & (ts <= t1 + rounding))
+    return possible & inside & jnp.all(jnp.diff(ts) >= 0)
 
 
 def _busyness(osc: Oscillator) -> float:
