@@ -122,6 +122,42 @@ def test_a_curve_of_touching_motions_is_the_response_without_the_edge():
         assert float(free.x1_max) == pytest.approx(edge, abs=1e-11)
 
 
+@pytest.mark.slow
+def test_a_branch_turns_back_at_the_edge_from_whichever_side_it_comes():
+    """From motions of two periods that touch, and from one of one period far off: the same."""
+
+    def edged(edge):
+        belt = jb.Belt(0.4, jb.Coulomb(1.0, 0.6), upper=edge)
+        return jb.Oscillator(0.1, (belt,), forcing=jb.Harmonic(0.6, 1.3))
+
+    found = []
+    for begun in (0.69, 0.7):
+        start = jb.find_cycle(edged(begun), (0.5, 0.0))
+        diagram = jb.bifurcation_diagram(edged, span=(0.6, 0.75), start=start)
+        assert diagram.open_ends == ()
+        found.append([(point.kind, float(point.value)) for point in diagram.points])
+    kinds, values = zip(*found[0])
+    assert kinds.count("GrazingEdge") == 1
+    assert kinds.count("Fold") == 1
+    assert [kind for kind, _ in found[1]] == list(kinds)
+    assert [value for _, value in found[1]] == pytest.approx(values, abs=1e-9)
+
+
+@pytest.mark.slow
+def test_a_belt_at_rest_is_touched_by_its_edge_and_has_no_corner_there():
+    """Its boundary is where x1 is extreme, so both conditions hold."""
+
+    def resting(edge):
+        belt = jb.Belt(0.0, jb.Coulomb(1.0, 1.0), load=0.3, upper=edge)
+        return jb.Oscillator(0.1, (belt,), forcing=jb.Harmonic(1.0, 0.7))
+
+    largest = float(jb.find_cycle(resting(np.inf), (0.0, 0.0)).x1_max)
+    point = jb.refine(jb.GrazingEdge(0), resting, at=1.77)
+    assert float(point.value) == pytest.approx(largest, abs=1e-11)
+    corner = jb.refine(jb.CornerCollision(0), resting, at=1.77)
+    assert int(corner.status) == jb.Status.OTHER_KIND
+
+
 # --- corners --------------------------------------------------------------------------------------
 
 AMPLITUDE, OMEGA, BELT, STATIC, KINETIC, OTHER = 0.5, 0.8, 0.5, 1.0, 0.8, 0.3

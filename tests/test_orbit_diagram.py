@@ -297,3 +297,14 @@ def test_runs_go_on_where_others_have_come_to_whatever_the_phase_and_the_first_f
     assert falling < rising
     for ratios, phase in (((1,), 1.5), ((1,), -1.0), ((1, 2), 0.0), ((2, 1), 0.0), ((0.5, 1), 0.0)):
         assert periodic_rows(forced(*ratios), phase) == [rising, falling]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("frequency", [0.7, 1.4])
+def test_a_diagram_comes_to_its_end_where_runs_end_on_a_moment(frequency):
+    """A moment at the end of a run was due in the condition of a loop and not in its body."""
+    belts = (jb.Belt(0.2, jb.Conti(1.0, 0.6, 10.0)),)
+    osc = jb.Oscillator(0.5, belts, forcing=jb.Harmonic(0.4, frequency))
+    options = dict(y0=(1.0, 0.0), sense="up", rows=2)
+    found = jb.orbit_diagram(osc, lambda osc: osc.forcing[0].amplitude, (0.8, 0.9), **options)
+    assert set(found.status.ravel().tolist()) == {jb.Status.OK}

@@ -901,3 +901,22 @@ def test_where_friction_jumps_two_motions_end_side_by_side():
         for start in ((-0.3427, 0.6498), (-0.355, 0.659))
     }
     assert len(durations) == 2
+
+
+@pytest.mark.slow
+def test_a_branch_does_not_come_home_the_way_that_it_has_gone():
+    """Two folds, and an end at which the tangent turns by a right angle."""
+
+    def between_two_belts(frequency):
+        belts = (jb.Belt(v, jb.Coulomb(1.0, 0.6), load=0.4) for v in (0.3, -0.3))
+        return jb.Oscillator(0.05, tuple(belts), forcing=jb.Harmonic(1.0, frequency))
+
+    for begun in (0.325, 0.35):
+        start = jb.find_cycle(between_two_belts(begun), (0.0, 0.0))
+        found = jb.bifurcation_diagram(between_two_belts, span=(0.285, 0.42), start=start)
+        values = [float(point.value) for point in found.points]
+        for expected in (0.322637908, 0.325369709, 0.355773559):
+            assert np.min(np.abs(np.subtract(values, expected))) < 1e-8
+        # Its end has a point, or is open.
+        ends = np.append(values, found.open_ends)
+        assert np.min(np.abs(ends - 0.325141094)) < 1e-8

@@ -37,6 +37,7 @@ from ..model.variations import Variation
 from ..numerics.continuation import Corrected
 from ..results import Status
 from .base import AbstractCondition, BifurcationPoint
+from .edges import GrazingEdge
 from .forced import (
     AbstractForcedCondition,
     AddingSliding,
@@ -491,6 +492,13 @@ def _beyond_point(
     parameter went."""
     if _jumps_at(point):
         return None
+    if isinstance(point.condition, GrazingEdge):
+        # It lies off by the root of the distance.
+        for one in point.condition.with_clock().motions_beyond(line.variation, point):
+            row = MotionRow(float(one.value), one.cycle)
+            passed = _has_passed(rows, row.value, line.at(row.value), row.motion)
+            if not passed and MotionLeg.begun(line, row)[1].found:
+                return row, float(np.sign(row.value - float(point.value)))
     last = rows[-1]
     direction, value = float(np.sign(direction)), float(point.value)
     periods, start = last.motion.periods, np.asarray(point.cycle.start)

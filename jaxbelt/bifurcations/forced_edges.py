@@ -7,6 +7,7 @@ distance: that is left out. In a corner an edge and a boundary, or slip onset, c
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,12 +16,21 @@ from jaxtyping import Array
 
 from ..cycles.clocked import TimedChain
 from ..cycles.shooting import end_guard
-from ..model.modes import STUCK, edges
-from ..model.oscillator import Oscillator
+from ..model.forcing import Oscillating
+from ..model.modes import STUCK, edges, mode_acceleration, mode_of
+from ..model.oscillator import Oscillator, at_time
+from ..model.own_units import in_own_units
+from ..model.variations import Variation
 from ..motion.arcs import Ends
-from .base import AbstractCondition
+from ..results import Status
+from .base import AbstractCondition, BifurcationPoint
 from .forced import AbstractForcedCondition, ArcRows, Beginning, minima_of_guards, without_one_of
-from .timed_systems import TimedSystem
+from .timed_systems import ARRIVES, TimedSystem
+
+#: How long a motion is to be beyond an edge behind the point where it touches it, in own units.
+EXCURSIONS = (3e-2, 1e-2, 3e-3)
+#: A motion this near to an edge touches it.
+TOUCHES = 1e-6
 
 
 class TwoEvents(TimedSystem):
@@ -33,6 +43,17 @@ class TwoEvents(TimedSystem):
 
     def condition(self, osc, z):
         return end_guard(osc, self.codes, self.end, z[self.row + 1, :3])
+
+
+class ArcOfDuration(TimedSystem):
+    """The arc `row` lasts for a given time."""
+
+    chain: TimedChain
+    row: Array
+    duration: Array
+
+    def condition(self, osc, z):
+        return z[self.row, 3] - self.duration
 
 
 class AbstractTimedEdge(AbstractForcedCondition):
@@ -65,9 +86,10 @@ class TimedEdgeGrazing(AbstractTimedEdge):
     def beginnings_of(self, osc, motion, known=False):
         rows, names = ArcRows.of(motion), Ends(len(osc.belts))
         for edge, same in self.ends_of_edges(osc):
+            # Where a belt is at rest its boundary is where x1 is extreme.
+            for row in _turning(rows):
+                yield _both(rows, _off_edge(osc, rows, row, edge), row, edge)
             if known:
-                for row in np.flatnonzero(rows.ends == names.extremum_x1).tolist():
-                    yield _both(rows, _off_edge(osc, rows, row, edge), row, edge)
                 continue
             short = [r for r in range(1, len(rows.ends) - 1) if _is_excursion(rows, r, same)]
             for shorter, row, value in without_one_of(rows, short, names.extremum_x1):
@@ -77,9 +99,43 @@ class TimedEdgeGrazing(AbstractTimedEdge):
                 cut = rows.cut(row, since, state, names.extremum_x1)
                 yield _both(cut, value, row, edge)
 
+    def motions_beyond(
+        self, variation: Variation, point: BifurcationPoint
+    ) -> Iterator[BifurcationPoint]:
+        """Motions that go beyond the edge for a short time, and the values at which they do."""
+        value = np.array([float(point.value)])
+        osc, rows = in_own_units(variation.oscillator(value)), ArcRows.of(point.cycle)
+        for edge, same in self.ends_of_edges(osc):
+            for row in _turning(rows):
+                for duration in EXCURSIONS:
+                    beyond = _with_excursion(osc, rows, row, edge, same, duration)
+                    if beyond is None or _off_edge(osc, rows, row, edge) > TOUCHES:
+                        continue
+                    numbers = jnp.asarray(row + 1), jnp.asarray(duration)
+
+                    def system(chain, numbers=numbers):
+                        return ArcOfDuration(chain, *numbers)
+
+                    found = self.point_of(variation, osc, value, Beginning(beyond, 0.0, system))
+                    if int(found.status) == Status.OK:
+                        yield found
+
 
 class TimedCorner(AbstractTimedEdge):
     """`CornerCollision` with a clock."""
+
+    def point_of(self, variation, osc, value, beginning):
+        point = super().point_of(variation, osc, value, beginning)
+        if int(point.status) != Status.OK:
+            return point
+        # A motion that only touches the edge meets the equations, too.
+        rows, own = ArcRows.of(point.cycle), in_own_units(point.oscillator)
+        touches = any(
+            _off_edge(own, rows, row, edge) < TOUCHES
+            for edge, _ in self.ends_of_edges(own)
+            for row in _turning(rows)
+        )
+        return replace(point, status=jnp.asarray(Status.OTHER_KIND.value)) if touches else point
 
     def beginnings_of(self, osc, motion, known=False):
         rows, n = ArcRows.of(motion), len(osc.belts)
@@ -108,6 +164,39 @@ class TimedCorner(AbstractTimedEdge):
             yield from ((before, belt) for belt in np.flatnonzero(touched).tolist())
 
 
+def _with_excursion(
+    osc: Oscillator, rows: ArcRows, row: int, edge: int, same: np.ndarray, duration: float
+) -> ArcRows | None:
+    """The arcs with one beyond the edge where that of a row touches it; None where the mass does
+    not come back from there."""
+    n, place = len(osc.belts), _edge_places(osc)[edge - len(osc.belts)]
+    time, codes = rows.z[row + 1, 2], rows.codes[row].copy()
+    now = at_time(osc, jnp.asarray(time))
+    way = np.sign(place - rows.z[row, 0])
+    for belt, is_upper in ((int(one) % n, one >= 2 * n) for one in same):
+        outside = np.abs(codes[belt]) == 2
+        velocity = float(now.belts[belt].velocity)
+        if outside and velocity == 0:
+            return None
+        codes[belt] = np.sign(velocity) if outside else (2 if is_upper else -2)
+    still = jnp.asarray(place), jnp.zeros(())
+    pull = float(mode_acceleration(now, mode_of(jnp.asarray(codes)), *still))
+    if pull * way >= 0:
+        return None
+    half = 0.5 * duration
+    before, after = rows.z[row].copy(), rows.z[row + 1]
+    before[3] -= half
+    beyond = np.array([place, -half * pull, time - half, duration])
+    then = np.array([place, half * pull, time + half, after[3] - half])
+    arcs = (rows.codes[row], edge, before), (codes, edge, beyond)
+    return rows.put(row, row + 1, *arcs, (rows.codes[row + 1], rows.ends[row + 1], then))
+
+
+def _turning(rows: ArcRows) -> list[int]:
+    """The arcs that end where x2 = 0."""
+    return np.flatnonzero(np.abs(rows.z[1:, 1]) < ARRIVES).tolist()
+
+
 def _off_edge(osc: Oscillator, rows: ArcRows, row: int, end: int) -> float:
     """How far from an edge an arc ends."""
     return abs(_edge_places(osc)[end - len(osc.belts)] - rows.z[row + 1, 0])
@@ -124,5 +213,8 @@ def _edge_places(osc: Oscillator) -> np.ndarray:
 
 
 def edged_belts(osc: Oscillator) -> list[int]:
-    """The numbers of the belts that have a contact edge, of a known oscillator."""
-    return np.flatnonzero(np.any(np.isfinite(_edge_places(osc).reshape(2, -1)), axis=0)).tolist()
+    """The numbers of the belts that have a contact edge, and a load, of a known oscillator."""
+    edged = np.any(np.isfinite(_edge_places(osc).reshape(2, -1)), axis=0)
+    loads = [belt.load for belt in osc.belts]
+    loaded = [isinstance(load, Oscillating) or float(load) != 0 for load in loads]
+    return np.flatnonzero(edged & loaded).tolist()
