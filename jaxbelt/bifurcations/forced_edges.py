@@ -30,7 +30,7 @@ from .timed_systems import ARRIVES, TimedSystem
 #: How long a motion is to be beyond an edge behind the point where it touches it, in own units.
 EXCURSIONS = (3e-2, 1e-2, 3e-3)
 #: A motion this near to an edge touches it.
-TOUCHES = 1e-6
+ON_THE_EDGE = 1e-6
 
 
 class TwoEvents(TimedSystem):
@@ -109,7 +109,7 @@ class TimedEdgeGrazing(AbstractTimedEdge):
             for row in _turning(rows):
                 for duration in EXCURSIONS:
                     beyond = _with_excursion(osc, rows, row, edge, same, duration)
-                    if beyond is None or _off_edge(osc, rows, row, edge) > TOUCHES:
+                    if beyond is None or _off_edge(osc, rows, row, edge) > ON_THE_EDGE:
                         continue
                     numbers = jnp.asarray(row + 1), jnp.asarray(duration)
 
@@ -131,7 +131,7 @@ class TimedCorner(AbstractTimedEdge):
         # A motion that only touches the edge meets the equations, too.
         rows, own = ArcRows.of(point.cycle), in_own_units(point.oscillator)
         touches = any(
-            _off_edge(own, rows, row, edge) < TOUCHES
+            _off_edge(own, rows, row, edge) < ON_THE_EDGE
             for edge, _ in self.ends_of_edges(own)
             for row in _turning(rows)
         )
