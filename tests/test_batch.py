@@ -376,6 +376,7 @@ def test_a_cycle_that_crosses_without_sticking():
     np.testing.assert_allclose(dataset.period, run.events[-1].t - run.events[-5].t, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_impossible_times_are_no_answers_and_harm_no_other_lane():
     """Known ones raise; traced ones had states from before the start, with the status OK."""
     osc, nan = jb.presets.class_b(0.45, 0.35), np.nan

@@ -395,6 +395,7 @@ def test_which_parameters_vary_belongs_to_the_question(tmp_path):
         jb.sweep(of_velocity, axes, y0=(1.0, 0.0), t1=20.0, store=store)
 
 
+@pytest.mark.slow
 def test_a_table_counts_to_its_last_digit(tmp_path):
     def with_table(last):
         law = jb.Tabulated((0.0, 0.5, 1.0), (1.0, 0.7, last))
@@ -406,6 +407,7 @@ def test_a_table_counts_to_its_last_digit(tmp_path):
         jb.sweep(with_table(0.6 + 1e-14), axes, y0=(1.0, 0.0), t1=20.0, store=store)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scaled", [False, True])
 def test_a_force_of_ones_own_counts_by_what_it_does(tmp_path, scaled):
     def make_of(power):
