@@ -146,6 +146,28 @@ def test_a_branch_turns_back_at_the_edge_from_whichever_side_it_comes():
 
 
 @pytest.mark.slow
+def test_a_fold_beside_the_point_is_seen_from_beyond_the_edge():
+    """The motion of two periods comes from far, turns, and touches; its multiplier grows then."""
+
+    def osc(amplitude):
+        belt = jb.Belt(6.0, jb.Coulomb(0.6, 0.6), upper=1.5, lower=-0.6)
+        forcing = jb.BaseMotion(amplitude, 0.7, 0.3), jb.Harmonic(0.8 * amplitude, 1.4, 1.0)
+        return jb.Oscillator(0.4, (belt,), forcing=forcing)
+
+    wide = jb.bifurcation_diagram(osc, span=(0.2, 1.6), start=(0.6, 0.0))
+    start = jb.find_cycle(osc(0.432), (0.6, 0.0))
+    narrow = jb.bifurcation_diagram(osc, span=(0.41, 0.45), start=start)
+    found, expected = (
+        [(p.kind, float(p.value)) for p in one.points if float(p.value) < 0.45]
+        for one in (wide, narrow)
+    )
+    assert [kind for kind, _ in found] == [kind for kind, _ in expected]
+    assert [kind for kind, _ in found].count("Fold") == 1
+    values = [value for _, value in expected]
+    assert [value for _, value in found] == pytest.approx(values, abs=1e-9)
+
+
+@pytest.mark.slow
 def test_a_belt_at_rest_is_touched_by_its_edge_and_has_no_corner_there():
     """Its boundary is where x1 is extreme, so both conditions hold."""
 

@@ -309,7 +309,7 @@ def _branch_leg(
                 borders, searched = _borders(line, last), step
             point = _border(line, borders, last, new.value, start)
             if point is not None:
-                between = _points_between(line, last, MotionRow(float(point.value), point.cycle))
+                between = _points_between(line, last, _row_at(line, last, point))
                 further = _beyond_point(line, [*behind, *rows], point, tangent[-1])
                 return rows, [*points, *between, point], further
             step, straight = 0.5 * step, 0
@@ -331,7 +331,7 @@ def _branch_leg(
         near = [p for p in _borders(line, last) if abs(float(p.value) - last.value) < within]
         point = _border(line, near, last, value, start)
         if point is not None:
-            between = _points_between(line, last, MotionRow(float(point.value), point.cycle))
+            between = _points_between(line, last, _row_at(line, last, point))
             further = _beyond_point(line, [*behind, *rows], point, tangent[-1])
             return rows, [*points, *between, point], further
         further = _past_corner(line, [*behind, *rows], value, start)
@@ -525,6 +525,21 @@ def _beyond_point(
                 if MotionLeg.begun(line, row)[1].found:
                     return row, side * direction
     return None
+
+
+def _row_at(line: ForcedLine, last: MotionRow, point: BifurcationPoint) -> MotionRow:
+    """The motion at the point in which the signature of the last row ends, with its multipliers.
+
+    Where one that goes beyond an edge comes to touch it, its multiplier grows beyond all bounds,
+    and the motion that only touches has another one: then it is a motion beside the point.
+    """
+    row = MotionRow(float(point.value), point.cycle)
+    if isinstance(point.condition, GrazingEdge):
+        for one in point.condition.with_clock().motions_beyond(line.variation, point):
+            value = float(one.value)
+            if is_same_motion(last.motion.at(line.at(value)), one.cycle):
+                row = MotionRow(value, one.cycle)
+    return row
 
 
 def _has_passed(
