@@ -309,7 +309,7 @@ def _branch_leg(
                 borders, searched = _borders(line, last), step
             point = _border(line, borders, last, new.value, start)
             if point is not None:
-                between = _points_between(line, last, _row_at(line, last, point))
+                between = _points_between(line, last, _row_at_point(line, last, point))
                 further = _beyond_point(line, [*behind, *rows], point, tangent[-1])
                 return rows, [*points, *between, point], further
             step, straight = 0.5 * step, 0
@@ -331,7 +331,7 @@ def _branch_leg(
         near = [p for p in _borders(line, last) if abs(float(p.value) - last.value) < within]
         point = _border(line, near, last, value, start)
         if point is not None:
-            between = _points_between(line, last, _row_at(line, last, point))
+            between = _points_between(line, last, _row_at_point(line, last, point))
             further = _beyond_point(line, [*behind, *rows], point, tangent[-1])
             return rows, [*points, *between, point], further
         further = _past_corner(line, [*behind, *rows], value, start)
@@ -527,7 +527,7 @@ def _beyond_point(
     return None
 
 
-def _row_at(line: ForcedLine, last: MotionRow, point: BifurcationPoint) -> MotionRow:
+def _row_at_point(line: ForcedLine, last: MotionRow, point: BifurcationPoint) -> MotionRow:
     """The motion at the point in which the signature of the last row ends, with its multipliers.
 
     Where one that goes beyond an edge comes to touch it, its multiplier grows beyond all bounds,
