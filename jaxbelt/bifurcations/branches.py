@@ -309,9 +309,8 @@ def _branch_leg(
                 borders, searched = _borders(line, last), step
             point = _border(line, borders, last, new.value, start)
             if point is not None:
-                between = _points_between(line, last, _row_at_point(line, last, point))
-                further = _beyond_point(line, [*behind, *rows], point, tangent[-1])
-                return rows, [*points, *between, point], further
+                ends, further = _through_point(line, [*behind, *rows], point, tangent[-1])
+                return rows, [*points, *ends], further
             step, straight = 0.5 * step, 0
             continue
         points += list(_points_between(line, last, new))
@@ -331,9 +330,8 @@ def _branch_leg(
         near = [p for p in _borders(line, last) if abs(float(p.value) - last.value) < within]
         point = _border(line, near, last, value, start)
         if point is not None:
-            between = _points_between(line, last, _row_at_point(line, last, point))
-            further = _beyond_point(line, [*behind, *rows], point, tangent[-1])
-            return rows, [*points, *between, point], further
+            ends, further = _through_point(line, [*behind, *rows], point, tangent[-1])
+            return rows, [*points, *ends], further
         further = _past_corner(line, [*behind, *rows], value, start)
         if further is not None:
             return rows, points, (further, float(np.sign(value - last.value)))
@@ -484,6 +482,30 @@ def _border(
     return min(ahead, key=lambda p: abs(float(p.value) - last.value), default=None)
 
 
+def _through_point(
+    line: ForcedLine, rows: list[MotionRow], point: BifurcationPoint, direction: float
+) -> tuple[list[BifurcationPoint], tuple[MotionRow, float] | None]:
+    """The points behind the last row, up to the one in which its signature ends, and how the branch
+    goes on from there, see `_beyond_point`."""
+    last, end = rows[-1], MotionRow(float(point.value), point.cycle)
+    beyond, further = [], None
+    if isinstance(point.condition, GrazingEdge):
+        # Those that go beyond the edge lie off by the root of the distance.
+        beyond = point.condition.with_clock().motions_beyond(line.variation, point)
+    for one in beyond:
+        row = MotionRow(float(one.value), one.cycle)
+        osc = line.at(row.value)
+        if is_same_motion(last.motion.at(osc), row.motion):
+            # Its multiplier grows beyond all bounds; the motion that only touches has another one.
+            end = row
+        elif further is None and not _has_passed(rows, row.value, osc, row.motion):
+            sense = float(np.sign(row.value - float(point.value)))
+            further = (row, sense) if MotionLeg.begun(line, row)[1].found else None
+    if further is None:
+        further = _beyond_point(line, rows, point, direction)
+    return [*_points_between(line, last, end), point], further
+
+
 def _beyond_point(
     line: ForcedLine, rows: list[MotionRow], point: BifurcationPoint, direction: float
 ) -> tuple[MotionRow, float] | None:
@@ -492,13 +514,6 @@ def _beyond_point(
     parameter went."""
     if _jumps_at(point):
         return None
-    if isinstance(point.condition, GrazingEdge):
-        # It lies off by the root of the distance.
-        for one in point.condition.with_clock().motions_beyond(line.variation, point):
-            row = MotionRow(float(one.value), one.cycle)
-            passed = _has_passed(rows, row.value, line.at(row.value), row.motion)
-            if not passed and MotionLeg.begun(line, row)[1].found:
-                return row, float(np.sign(row.value - float(point.value)))
     last = rows[-1]
     direction, value = float(np.sign(direction)), float(point.value)
     periods, start = last.motion.periods, np.asarray(point.cycle.start)
@@ -525,21 +540,6 @@ def _beyond_point(
                 if MotionLeg.begun(line, row)[1].found:
                     return row, side * direction
     return None
-
-
-def _row_at_point(line: ForcedLine, last: MotionRow, point: BifurcationPoint) -> MotionRow:
-    """The motion at the point in which the signature of the last row ends, with its multipliers.
-
-    Where one that goes beyond an edge comes to touch it, its multiplier grows beyond all bounds,
-    and the motion that only touches has another one: then it is a motion beside the point.
-    """
-    row = MotionRow(float(point.value), point.cycle)
-    if isinstance(point.condition, GrazingEdge):
-        for one in point.condition.with_clock().motions_beyond(line.variation, point):
-            value = float(one.value)
-            if is_same_motion(last.motion.at(line.at(value)), one.cycle):
-                row = MotionRow(value, one.cycle)
-    return row
 
 
 def _has_passed(

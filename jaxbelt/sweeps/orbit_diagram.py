@@ -301,17 +301,18 @@ class Sampling:
 
     def _strobed(self, grid: Grid, values: np.ndarray) -> OrbitDiagram:
         """The diagram of a stroboscopic section: STROBES points behind PERIODS_LEFT_OUT periods."""
-        runs = [self._make(value) for value in values for _ in self.starts]
-        period = 2 * np.pi / np.array([float(frequencies(osc)[0]) for osc in runs])
+        waves = np.array([frequencies(self._make(value)) for value in values], dtype=float).T
+        waves = np.repeat(waves, len(self.starts), axis=1)
+        period = 2 * np.pi / waves[0]
         left_out = PERIODS_LEFT_OUT_BESIDE if self.senses else PERIODS_LEFT_OUT
         reducer = _KeptMoments((self.at,), STROBES, ("x1", "x2"), left_out)
         off = OFF_ATTRACTOR * grid.length()
         # Where all waves together have a period, runs go on at the time in it that others came to.
-        turns = np.array([max(1, int(common_turns(osc, jnp.zeros((), int)))) for osc in runs])
+        turns = np.asarray(common_turns(list(jnp.asarray(waves)), jnp.zeros(period.size, int)))
+        turns = np.maximum(turns, 1)
         # No moment is at t1, where rounding decides whether it counts.
         t1 = float(np.max(period)) * (left_out + STROBES + int(np.max(turns)) + 0.5)
-        passed = np.zeros(len(runs), int)
-        passed[:] = np.ceil(-self.at.phase / (2 * np.pi) - 1e-12)
+        passed = np.full(period.size, int(np.ceil(-self.at.phase / (2 * np.pi) - 1e-12)))
 
         def further(found, which, following):
             *state, last = reducer.last_state(found)

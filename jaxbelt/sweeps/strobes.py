@@ -6,7 +6,7 @@ and ends a run as soon as it knows one. Where there is none until the end of the
 exponent decides.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import ClassVar
 
@@ -19,7 +19,7 @@ from ..cycles.clocked import RATIO_ROUNDING, RATIOS
 from ..cycles.settling import way_left
 from ..kernel.lanes import Lanes, Observer, Variable, choose, materialise
 from ..model.instants import blur
-from ..model.oscillator import Oscillator, frequencies
+from ..model.oscillator import frequencies
 from ..model.own_units import OwnOscillator
 from ..numerics.implicit import step_to_root
 from ..results import Status
@@ -178,7 +178,7 @@ class ForcedAttractor(Observer):
 
     def start(self, osc, lanes):
         zero, count = jnp.zeros_like(lanes.t), jnp.zeros_like(lanes.events)
-        turns = common_turns(osc, count)
+        turns = common_turns(frequencies(osc), count)
         passed = jnp.floor(lanes.t / _strobe_period(osc, turns) * (1 + 1e-14) + 1e-12)
         nowhere, never = zero + jnp.nan, jnp.full_like(count, -1)
         patience = count + FIRST_PATIENCE
@@ -415,9 +415,10 @@ class ForcedAttractor(Observer):
         }
 
 
-def common_turns(osc: Oscillator, none: Array) -> Array:
-    """As `turns_of`, of each lane, as numbers like `none`, its 0 where there is no such period."""
-    first, *others = (jnp.broadcast_to(one, none.shape)[..., None] for one in frequencies(osc))
+def common_turns(waves: Sequence[Array], none: Array) -> Array:
+    """As `turns_of`, by the frequencies, of each lane, as numbers like `none`, its 0 where there is
+    no such period."""
+    first, *others = (jnp.broadcast_to(one, none.shape)[..., None] for one in waves)
     turns = jnp.arange(1, RATIOS + 1, dtype=first.dtype).reshape((1,) * none.ndim + (RATIOS,))
     whole = jnp.ones((*none.shape, RATIOS), bool)
     for other in others:
