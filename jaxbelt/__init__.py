@@ -23,7 +23,8 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     kernel/         lanes marks step events rounds waves holds clocked timed_events
     motion/         integrators arcs flights sensitivities sampling loops batches timed runs
     motion/         smoothing simulate
-    cycles/         chains settling shooting motions closure clocked followed periodic exponents
+    cycles/         chains settling shooting motions closure clocked followed periodic reached
+    cycles/         exponents
     cycles/         orbits cycle attractors functionals backwards returns separatrices portrait
     cycles/         unstable outlines nearest sides shocks
     sweeps/         observers moments along reducers attractor growth winding strobes queue

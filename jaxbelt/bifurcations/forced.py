@@ -35,15 +35,14 @@ from ..cycles.clocked import (
 )
 from ..cycles.periodic import (
     PeriodicMotion,
-    attracted,
     begun_off_events,
     motion_at,
-    motions_of,
     nothing_found,
     periodic_from,
     periods_of,
     state_at_phase_0,
 )
+from ..cycles.reached import attracted, motions_of
 from ..model.instants import guards_trend
 from ..model.modes import STUCK, mode_of
 from ..model.oscillator import Oscillator, check_clock

@@ -39,7 +39,7 @@ from .chains import SIZES, Chain, Loop, first_failure, modes_of, room_of
 from .closure import admissible, closure
 from .motions import ClosedMotion
 from .orbits import MOST_ARCS, follow, last_loop, loop_of
-from .periodic import motion_reached
+from .reached import motion_reached
 from .shooting import ARC_STEPS, closed, meshed, residual, solve_closed
 
 if TYPE_CHECKING:

@@ -30,7 +30,8 @@ from ..checks import (
 )
 from ..cycles.clocked import turns_of
 from ..cycles.cycle import Cycle, cycle_from, cycle_of_zeros
-from ..cycles.periodic import PeriodicMotion, motion_reached, nothing_found
+from ..cycles.periodic import PeriodicMotion, nothing_found
+from ..cycles.reached import motion_reached
 from ..model.oscillator import Oscillator, check_oscillator, frequencies, has_clock, refuse_clock
 from ..model.parameters import leaf_index
 from ..numerics.compiling import jit

@@ -1,0 +1,145 @@
+"""The periodic motion to which a start of a forced oscillator leads: what `find_cycle` finds.
+
+An orbit is followed for many periods of the forcing. Where it is nearly back after some of them,
+`periodic` solves for a motion, which is the answer if it is stable and draws the orbit in.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Array
+
+from ..model.oscillator import Oscillator
+from ..results import Status
+from .followed import PERIODS_AT_ONCE, Followed, after_period, arcs_over
+from .periodic import (
+    PeriodicMotion,
+    differentiable_motion,
+    is_same_motion,
+    monodromy_of,
+    nothing_found,
+    of_least_periods,
+    solved_from,
+)
+
+#: Runs after which an orbit is given up that comes slowly near to a periodic motion, and one that
+#: does not.
+MOST_SLOW, MOST_RESTLESS = 256, 32
+#: States after n periods that differ by less, relative to their size, may be one motion's; and by
+#: how much they have to be nearer to each other before they are tried again.
+NEARLY_BACK, HARDLY_BACK, NEARER = 1e-6, 1e-2, 0.1
+#: An orbit this near to a stable motion, relative to its size, comes to it; farther away it is
+#: asked, unless the eigenvectors of the motion are nearly parallel, by this condition number.
+NEAR_MOTION, MOST_SKEW = 1e-5, 1e6
+
+
+def attracted(osc: Oscillator, y0: Any, turns: int) -> PeriodicMotion:
+    """The periodic motion that a start leads to, of a known oscillator in its own units."""
+    y, due = np.asarray(y0, float), 1
+    failed: dict[int, float] = {}
+    for run in range(1, MOST_SLOW + 1):
+        followed = arcs_over(osc, y, turns)
+        if len(followed.starts) <= PERIODS_AT_ONCE:
+            return nothing_found(osc, turns, followed.status or Status.NOT_FINITE.value)
+        nearly = _nearly_back(followed.starts)
+        # Slow approaches are tried now and then, and any other once it is nearer by far.
+        is_due = run == due
+        due *= 1 + is_due
+        for periods, away in nearly.items():
+            if not is_due and away > min(NEARLY_BACK, NEARER * failed.get(periods, np.inf)):
+                continue
+            found = _reached(osc, followed, periods, turns)
+            if found is not None:
+                return of_least_periods(osc, found, turns)
+            failed[periods] = away
+        if run >= MOST_RESTLESS and not nearly:
+            break
+        y = after_period(osc, followed)
+    return nothing_found(osc, turns, Status.NOT_SETTLED)
+
+
+def _nearly_back(starts: np.ndarray) -> dict[int, float]:
+    """Numbers of periods after which an orbit is nearly back, ever nearer, and how far from there
+    it was, relative to its size; of these each is nearer than with fewer periods."""
+    size = 1 + np.max(np.abs(starts))
+    found, nearest = {}, HARDLY_BACK
+    for periods in range(1, PERIODS_AT_ONCE // 2 + 1):
+        away, before = (
+            np.max(np.abs(starts[-1 - k * periods] - starts[-1 - (k + 1) * periods])) / size
+            for k in range(2)
+        )
+        if away < nearest and away <= max(before, NEARLY_BACK):
+            found[periods], nearest = away, 0.5 * away
+    return found
+
+
+def _reached(
+    osc: Oscillator, followed: Followed, periods: int, turns: int
+) -> PeriodicMotion | None:
+    """The stable motion to which an orbit comes that is nearly back after some periods; or one of a
+    continuum, on which it is."""
+    motion = solved_from(osc, followed.last(periods).loop(), turns)
+    if int(motion.status) == Status.NEUTRAL:
+        return motion
+    if int(motion.status) != Status.OK or not bool(motion.stable):
+        return None
+    off = followed.starts[-1 - periods] - np.asarray(motion.start)
+    near = np.max(np.abs(off)) < NEAR_MOTION * (1 + np.max(np.abs(followed.starts)))
+    return motion if near or _draws_in(osc, motion, off, turns) else None
+
+
+def _draws_in(osc: Oscillator, motion: PeriodicMotion, off: np.ndarray, turns: int) -> bool:
+    """Whether a stable motion draws in what is as far from it as a state that is off by that, [2].
+
+    In the basis of the eigenvectors of its monodromy matrix a small difference turns and shrinks,
+    or shrinks along each axis. So the way from that state to the motion stays in an ellipse, or in
+    a rectangle. Orbits from around its rim have to pass the events of the motion, and to shrink.
+    """
+    values, vectors = np.linalg.eig(np.asarray(monodromy_of(osc, motion.chain, motion.unknowns)))
+    turning = np.iscomplexobj(values)
+    basis = vectors
+    if turning:
+        basis = np.column_stack([np.real(vectors[:, 0]), np.imag(vectors[:, 0])])
+    if not np.linalg.cond(basis) < MOST_SKEW:
+        return False
+    inside = np.linalg.inv(basis)
+    size = np.hypot(*(inside @ off)) if turning else np.abs(inside @ off)
+    chain, periods = motion.chain, motion.periods
+    used = np.asarray(chain.used)
+    times = PERIODS_AT_ONCE // periods
+    codes = np.tile(np.asarray(chain.codes)[used], (times, 1))
+    ends = np.tile(np.asarray(chain.ends)[used], times)
+    for rim in _RIM:
+        scaled = rim / np.hypot(*rim) if turning else rim
+        begun = scaled * size
+        orbit = arcs_over(osc, np.asarray(motion.start) + basis @ begun, turns)
+        if len(orbit.starts) <= times * periods:
+            return False
+        orbit = orbit.first(times * periods)
+        left = inside @ (orbit.starts[-1] - np.asarray(motion.start))
+        same = np.array_equal(orbit.codes, codes) and np.array_equal(orbit.ends, ends)
+        if not same or np.hypot(*left) > np.hypot(*begun) + NEARLY_BACK * np.hypot(*off):
+            return False
+    return True
+
+
+#: Places on the rim of a square: its corners and the middles of its sides.
+_RIM = np.array([[i, j] for i in (-1.0, 0.0, 1.0) for j in (-1.0, 0.0, 1.0) if (i, j) != (0, 0)])
+
+
+def motion_reached(osc: Oscillator, y0: Array) -> PeriodicMotion:
+    """What `find_cycle` returns of an oscillator with a clock."""
+    return differentiable_motion(osc, y0, attracted)
+
+
+def motions_of(osc: Oscillator, starts: Sequence[Any], turns: int) -> list[PeriodicMotion]:
+    """The different periodic motions to which some starts lead."""
+    found: list[PeriodicMotion] = []
+    for start in starts:
+        motion = attracted(osc, start, turns)
+        if int(motion.status) == Status.OK and not any(
+            is_same_motion(motion, one) for one in found
+        ):
+            found.append(motion)
+    return found
