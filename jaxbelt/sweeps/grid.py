@@ -83,6 +83,8 @@ class Grid:
         self.mapped = self.mapped if self.edges else self._varying()
         pairs = zip(leaves, self.mapped, strict=True)
         self.shared = [jnp.asarray(leaf) for leaf, mapped in pairs if not mapped]
+        #: `rows` of all runs of a small grid, by derivatives.
+        self.known_rows: dict[tuple[str, ...], np.ndarray] = {}
 
     def _varying(self) -> tuple[bool, ...]:
         """For each leaf of the oscillator whether it depends on an axis."""
@@ -130,6 +132,13 @@ class Grid:
 
     def rows(self, runs: np.ndarray, derivatives: tuple[str, ...] = ()) -> np.ndarray:
         """Starts and varying parameters of some runs, [1 + derivatives, columns, runs]."""
+        if self.runs > FEWEST_ROWS:
+            return self._computed_rows(runs, derivatives)
+        if derivatives not in self.known_rows:
+            self.known_rows[derivatives] = self._computed_rows(np.arange(self.runs), derivatives)
+        return self.known_rows[derivatives][:, :, runs]
+
+    def _computed_rows(self, runs: np.ndarray, derivatives: tuple[str, ...]) -> np.ndarray:
         size = power_of_two(len(runs), FEWEST_ROWS)
         places = np.unravel_index(np.resize(runs, size), self.shape)
         values = {

@@ -187,6 +187,8 @@ class _Team:
     chunks: _Chunks
     first_passes: int
     stop: threading.Event = field(default_factory=threading.Event)
+    #: Streams that the threads begin with, on each device; a kernel does not change what it gets.
+    streams: dict[Any, Any] = field(default_factory=dict)
 
     def compile(self, device) -> None:
         """Compiles the kernel by a call with nothing to do, on a device as `work` calls it."""
@@ -194,13 +196,18 @@ class _Team:
         with _settings(device):
             call = Call(zero, zero, zero, zero, np.bool_(False))
             queue = jax.device_put(self._queue())
-            jax.block_until_ready(self.kernel(queue, call, self.idle()))
+            jax.block_until_ready(self.kernel(queue, call, self._streams(device)))
+
+    def _streams(self, device) -> Any:
+        if device not in self.streams:
+            self.streams[device] = self.idle()
+        return self.streams[device]
 
     def work(self, device) -> None:
         """Takes chunks until there are no more, or until the team is stopped."""
         with _settings(device):
             passes = self.first_passes
-            streams, todo = self.idle(), self.chunks.take()
+            streams, todo = self._streams(device), self.chunks.take()
             while todo is not None and not self.stop.is_set():
                 (first, last), todo = todo, self.chunks.take()
                 queue, drain = self._queue(), todo is None
