@@ -464,6 +464,31 @@ def test_derivatives_are_differences_of_the_engine():
 
 
 @pytest.mark.slow
+def test_derivatives_where_a_moving_belt_passes_the_bend_of_its_law():
+    """There steps have to be short for the motion of the mass relative to the belt."""
+    wave = 1.5784433
+    belt = forced.Belt(
+        forced.Oscillating(-0.37681613, 0.61460606, wave, 2.98708225),
+        ("conti", 1.10739975, 1.03172114, 10.58908380, 0.04163986),
+        load=0.60798073,
+        upper=0.82610703,
+    )
+    load = forced.Oscillating(1.36843843, 1.11128597, wave, 0.33069544)
+    other = forced.Belt(0.39971060, ("coulomb", 1.05062571, 0.50223336), load, lower=0.59368429)
+    forces = tuple(
+        forced.Harmonic(amplitude, wave, phase)
+        for amplitude, phase in ((1.49625279, 1.30318582), (0.64073247, 1.70330296))
+    )
+    osc = forced.Oscillator(0.38036077, (belt, other), forces, 1.37035268)
+    case = forced_cases.Case(osc, (2.10191435, 1.61053796), T=20.0)
+    direction = np.cos(np.arange(len(forced_cases._numbers(case)[0])))
+    direction = np.array(forced_cases.tied(case, direction))
+    known, error = forced_cases.derivative(case, direction)
+    off = np.max(np.abs(forced_package.derivative(case, direction) - known))
+    assert error < 1e-8 and off < 1e-7 * (1 + np.max(np.abs(known)))
+
+
+@pytest.mark.slow
 def test_reverse_mode_is_the_transpose_and_samples_have_derivatives():
     osc = forced_one(law=jb.Cubic(1.5, 1.5, 0.45), velocity=1.0)
 

@@ -283,21 +283,37 @@ def density(osc: Oscillator, mode: Mode, x1: Array, x2: Array, *t: Array) -> Arr
     is small.
     """
     waves = [fastest(osc)] if has_clock(osc) else []
-    osc = _oscillator_at(osc, (x1, x2, *t))
+    now = _oscillator_at(osc, (x1, x2, *t))
     a, a_by_x2 = jax.jvp(
-        lambda x2: mode_acceleration(osc, mode, x1, x2), (x2,), (jnp.ones_like(x2),)
+        lambda x2: mode_acceleration(now, mode, x1, x2), (x2,), (jnp.ones_like(x2),)
     )
-    bend = jnp.zeros(())
-    for belt, code in zip(osc.belts, mode.codes, strict=True):
-        speed = jnp.maximum(jnp.sign(code) * (belt.velocity - osc.omega * x2), 0.0)
+    r_slopes, r_curvatures = _relative_motions(osc, mode, a, x1, x2, *t)
+    bends, turns = jnp.zeros(()), jnp.zeros(())
+    for belt, code, slope, curvature in zip(
+        now.belts, mode.codes, r_slopes, r_curvatures, strict=True
+    ):
+        speed = jnp.maximum(jnp.sign(code) * (belt.velocity - now.omega * x2), 0.0)
 
         here, at_boundary = _bends(belt, jnp.stack([speed, jnp.zeros_like(speed)]))
         thin = jnp.maximum(0.0, 1.0 - THIN / jnp.maximum(at_boundary, THIN))
         nearing = thin * at_boundary / (1 + at_boundary * speed)
-        bend = bend + jnp.where(jnp.abs(code) == 1, jnp.maximum(here, nearing), 0.0)
-    near_extremum = jnp.sqrt(bend * jnp.abs(osc.omega * x2))  # where x2' = 0, x2'' = -x2
-    wanted = 1 + 0.4 * bend * jnp.abs(osc.omega * a) + near_extremum
+        bend = jnp.where(jnp.abs(code) == 1, jnp.maximum(here, nearing), 0.0)
+        bends, turns = bends + bend * jnp.abs(slope), turns + bend * jnp.abs(curvature)
+    wanted = 1 + 0.4 * bends + jnp.sqrt(turns)
     return functools.reduce(jnp.maximum, [wanted, 0.5 * fastest_rate(a_by_x2), *waves])
+
+
+def _relative_motions(osc: Oscillator, mode: Mode, a: Array, x1: Array, x2: Array, *t: Array):
+    """How fast the mass moves away from each belt, r', and r'' where it has an extremum."""
+    if not has_clock(osc):  # x2'' = -x2 where x2' = 0
+        return [osc.omega * a] * len(osc.belts), [osc.omega * x2] * len(osc.belts)
+
+    def slopes(x1, t):
+        now = at_time(osc, t)
+        a = mode_acceleration(now, mode, x1, x2)
+        return [now.omega * a - getattr(belt, "rate", 0.0) for belt in now.belts]
+
+    return jax.jvp(slopes, (x1, *t), (x2, jnp.ones_like(x2)))
 
 
 class Graded(AbstractIntegrator):
