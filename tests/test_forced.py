@@ -120,6 +120,27 @@ def test_a_constant_force_in_a_sweep_is_the_origin_moved():
         assert float(run.ys[-1, 0]) + push == pytest.approx(x1, abs=1e-6)
 
 
+@pytest.mark.slow
+def test_derivatives_of_sweeps_with_constant_forces():
+    """Of their amplitudes and phases, of both, and of another number beside a phase."""
+    law = jb.Conti(1.0, 0.6, 10.0)
+
+    def make(push, phase, damping):
+        forces = jb.Harmonic(push, 0.0, phase), jb.BaseMotion(0.1 * push, 0.0, 0.3)
+        return jb.Oscillator(damping, (jb.Belt(0.3, law, 0.7),), forcing=forces)
+
+    at = dict(push=0.3, phase=0.4, damping=0.1)
+    axes = {name: [value] for name, value in at.items()}
+    swept = jb.sweep(make, axes, y0=(0.5, -0.3), t1=4.0, derivatives=tuple(at), rtol=1e-11)
+    exact = jax.jacfwd(
+        lambda numbers: jb.simulate(make(*numbers), (0.5, -0.3), 4.0, ts=[4.0]).ys[-1]
+    )(jnp.array(list(at.values())))
+    found = [
+        [swept[f"d_{x}_end_d_{name}"].item() for name in at] for x in ("x1", "x2")
+    ]  # fmt: skip
+    assert np.allclose(found, exact, rtol=0, atol=1e-7) and np.all(np.abs(exact[0]) > 1e-3)
+
+
 def test_at_an_instant_it_is_an_oscillator_without_a_clock():
     belts = (
         jb.Belt(jb.Oscillating(0.2, 0.1, 1.2, 0.5), jb.Coulomb(1.0, 0.8)),

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 import jaxbelt as jb
 from jaxbelt.bifurcations.bounds import Bounds, _without_known, neighbours_that_differ
-from jaxbelt.bifurcations.cells import motions_in_cells, region_name
+from jaxbelt.bifurcations.cells import belts_of_letters, motions_in_cells, region_name
 from jaxbelt.bifurcations.labels import Label
 from jaxbelt.bifurcations.regions import RegionMap, varied_by_names
 from jaxbelt.numerics.continuation import Stop
@@ -60,6 +60,16 @@ def test_names_tell_equilibria_where_there_are_edges():
     # None of it where there are none: belts that run in opposite directions have digits there.
     without = jb.presets.class_b(-0.2, 0.3)
     assert region_name(without, Label(rests[:1], ())) == "6"
+
+
+def test_each_set_of_belts_has_a_name_of_its_own():
+    """Of six belts, too: letters end where s, which stands for no belt, would come."""
+    osc = jb.Oscillator(0.1, tuple(jb.Belt(0.1 * (i + 1), jb.Coulomb(1.0, 0.8)) for i in range(6)))
+    sets = [tuple(b for b in range(6) if code >> b & 1) for code in range(64)]
+    modes = [tuple(0 if b in stuck else 1 for b in range(6)) for stuck in sets]
+    names = [region_name(osc, Label((), ((mode,),))) for mode in modes]
+    assert len(set(names)) == 64 and all(name.isprintable() for name in names)
+    assert [belts_of_letters(name[1:])[0] for name in names] == [list(stuck) for stuck in sets]
 
 
 AXES = {"nu0": np.linspace(0.15, 0.35, 7), "sigma": np.linspace(0.6, 1.0, 6)}

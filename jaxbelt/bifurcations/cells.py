@@ -6,6 +6,7 @@ which every cycle that sticks passes, and several distances from an equilibrium.
 what a path through it finds.
 """
 
+import re
 from collections.abc import Callable, Collection, Sequence
 from typing import Any, NamedTuple
 
@@ -39,6 +40,8 @@ LETTERS = {
     EquilibriumKind.PSEUDO_FOCUS: "p",
     EquilibriumKind.SEGMENT: "h",
 }
+#: The letter of a cycle without sticking.
+NEVER_STICKS = "s"
 
 
 # --- names ----------------------------------------------------------------------------------------
@@ -50,7 +53,7 @@ def region_name(osc: Oscillator, label: Label) -> str:
     A digit: 1 there is a stable equilibrium only; 2 a stable cycle, too; 3 a stable cycle only.
     Where belts run in opposite directions these are 6, 5 and 4. With several belts a letter for
     each cycle shows what it sticks to: a belt 0, b belt 1, c both (belts as binary digits, for more
-    of them), s none.
+    of them; from the number 19 on, which would be s, the belts in square brackets), s none.
 
     With contact edges there may be several equilibria, of several kinds. There the digit is 1, 2 or
     3 in whatever directions belts run, and after a colon the equilibria follow from left to right:
@@ -66,6 +69,26 @@ def region_name(osc: Oscillator, label: Label) -> str:
 
 def _is_edged(osc: Oscillator) -> bool:
     return bool(np.any(np.isfinite([(belt.lower, belt.upper) for belt in osc.belts])))
+
+
+def _letter_of(stuck: Collection[int]) -> str:
+    """The letter of a cycle that sticks to these belts, or their numbers in square brackets."""
+    code = sum(2**belt for belt in set(stuck))
+    if ord("a") + code - 1 < ord(NEVER_STICKS):
+        return chr(ord("a") + code - 1) if code else NEVER_STICKS
+    return f"[{','.join(map(str, sorted(set(stuck))))}]"
+
+
+def belts_of_letters(letters: str) -> list[list[int]]:
+    """For each cycle of a region's name the belts to which it sticks."""
+    found = []
+    for letter in re.findall(r"\[[\d,]+\]|[a-z]", letters):
+        if letter.startswith("["):
+            found.append([int(belt) for belt in letter[1:-1].split(",")])
+        else:
+            code = 0 if letter == NEVER_STICKS else ord(letter) - ord("a") + 1
+            found.append([belt for belt in range(code.bit_length()) if code >> belt & 1])
+    return found
 
 
 def _name(
@@ -85,10 +108,7 @@ def _name(
     if not rests and not cycles:
         return ""
     number = 2 if rests and cycles else 3 if cycles else 1
-    letters = []
-    for stuck in cycles:
-        code = sum(2**belt for belt in set(stuck))
-        letters.append(chr(ord("a") + code - 1) if code else "s")
+    letters = [_letter_of(stuck) for stuck in cycles]
     tail = "".join(sorted(letters)) if belts > 1 else "s" * letters.count("s")
     if not edged:
         return f"{7 - number if opposite else number}{tail}"

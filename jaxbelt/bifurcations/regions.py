@@ -35,7 +35,7 @@ from ..numerics.widths import as_here
 from ..results import draw
 from ..tables import table_of
 from .bounds import Bounds, Pair
-from .cells import in_plane_of_paper, made_at, motions_in_cells
+from .cells import belts_of_letters, in_plane_of_paper, made_at, motions_in_cells
 from .curves import BifurcationCurve, given_curve
 from .faces import Faces
 
@@ -52,8 +52,9 @@ class RegionMap(eqx.Module):
     In the name of a region a digit says what attracts: 1 an equilibrium only, 2 a cycle, too, 3
     cycles only; 6, 5 and 4 are the same where belts run in opposite directions. With several belts
     a letter for each cycle says what it sticks to: a belt 0, b belt 1, c both (d belt 2, and on as
-    binary digits); s, with one belt too, is a cycle that never sticks. These are the names of the
-    paper's Fig. 6; pictures show them in its plane only, as notebook 03 does.
+    binary digits; of five belts or more some as [0,1,4]); s, with one belt too, is a cycle that
+    never sticks. These are the names of the paper's Fig. 6; pictures show them in its plane only,
+    as notebook 03 does.
 
     Attributes:
         names: Names of the two parameters, arguments of `make`.
@@ -184,10 +185,8 @@ def _attractors_of(name: str, belts: int) -> str:
     if belts == 1:
         words += {"2": ["cycle"], "3": ["cycle"]}.get(digit, [])
         words = [f"{word} without sticking" if "s" in letters else word for word in words]
-    for letter in letters if belts > 1 else "":
-        code = ord(letter) - ord("a") + 1
-        stuck = [str(belt) for belt in range(belts) if code >> belt & 1] if letter != "s" else []
-        which = f"belt{'s' * (len(stuck) > 1)} {', '.join(stuck)}"
+    for stuck in belts_of_letters(letters) if belts > 1 else []:
+        which = f"belt{'s' * (len(stuck) > 1)} {', '.join(map(str, stuck))}"
         words.append(f"cycle on {which}" if stuck else "cycle without sticking")
     return "; ".join(words)
 

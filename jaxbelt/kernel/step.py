@@ -23,6 +23,7 @@ size one in the linearised field.
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from operator import methodcaller
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -33,7 +34,6 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
-from ..model.friction import AbstractFriction
 from ..model.modes import (
     ULPS,
     bounds_leftward,
@@ -190,7 +190,8 @@ def _(primals, tangents):
     more division keeps their sum."""
     osc, signs, pulls, ones, _, x2 = primals
     d_osc, _, d_pulls, _, d_x1, d_x2 = tangents
-    pushes = [(1.0, d_push) for d_push in constant_force(d_osc)]
+    pushed = _changed(osc.forcing, d_osc.forcing, lambda forces: [one.push for one in forces])
+    pushes = [(1.0, d_push) for d_push in pushed[1]] if pushed else []
     total = _sum_of_changes((-1.0, d_x1), (-osc.damping, d_x2), (-x2, d_osc.damping), *pushes)
     forces = zip(osc.belts, d_osc.belts, signs, pulls, d_pulls, strict=True)
     for belt, d_belt, sign, pull, d_pull in forces:
@@ -201,7 +202,9 @@ def _(primals, tangents):
         relative = ((1.0, d_belt.velocity), (-osc.omega, d_x2), (-x2, d_osc.omega))
         total = total + slope * _sum_of_changes(*relative)
         total = total + _sum_of_changes((top * bottom / square, d_pull))
-        total = total + pull * _change_of_law(law, d_belt.friction, speed, square)
+        if changed := _changed(law, d_belt.friction, methodcaller("fraction", speed)):
+            (top, bottom), (d_top, d_bottom) = changed
+            total = total + pull * ((d_top * bottom - top * d_bottom) / square)
     return as_quotient(*primals), materialise(total, ones)
 
 
@@ -211,20 +214,15 @@ def _sum_of_changes(*pairs: tuple[Any, Any]) -> Any:
     return functools.reduce(jnp.add, known) if known else 0.0
 
 
-def _change_of_law(law: AbstractFriction, change: Any, speed: Array, square: Array) -> Any:
-    """How mu at a speed changes with the parameters of a law; square: of its denominator."""
-    leaves, structure = jax.tree.flatten(law)
+def _changed(tree: Any, change: Any, function: Callable[[Any], Any]) -> tuple[Any, Any] | None:
+    """A function of a tree and how it changes with it; None where nothing of the tree changes."""
+    leaves, structure = jax.tree.flatten(tree)
     changes = jax.tree.leaves(change)
     if all(isinstance(one, SymbolicZero) for one in changes):
-        return 0.0
+        return None
     pairs = zip(leaves, changes, strict=True)
     full = [jnp.zeros_like(x) if isinstance(dx, SymbolicZero) else dx for x, dx in pairs]
-
-    def fraction(leaves):
-        return jax.tree.unflatten(structure, leaves).fraction(speed)
-
-    (top, bottom), (d_top, d_bottom) = jax.jvp(fraction, (leaves,), (full,))
-    return (d_top * bottom - top * d_bottom) / square
+    return jax.jvp(lambda leaves: function(structure.unflatten(leaves)), (leaves,), (full,))
 
 
 def combine(weights: np.ndarray, arrays: Sequence[Array]) -> Array:
