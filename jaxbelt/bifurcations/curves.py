@@ -57,6 +57,8 @@ if TYPE_CHECKING:
 SHORTEST_PART = 1e-3
 #: Where no step is short enough, a point of codimension two this near is in the way, in steps.
 JUST_AHEAD = 0.02
+#: How often the step in which the motion ceases to exist is halved to find where.
+HALVINGS_TO_END = 10
 #: Number of points after which the integration steps are distributed anew.
 REMESH = 10
 
@@ -369,7 +371,7 @@ def _side(
             track, u, direction = track.remeshed(last, points[-1][0].tangent)
             continue
         # The signature changes here, or between the last two points.
-        centre = last[-2:] if beyond is None else 0.5 * (last + beyond.u)[-2:]
+        centre = last[-2:] if beyond is None else _where_it_ends(track, points[-1][0], beyond)
         centre = np.array(changes[-1].values) if changes else centre
         is_end = bool(changes) and problem.condition.ends_at_contact
         further = None if is_end else beyond_change(problem, track, rows, last, centre, changes)
@@ -380,6 +382,18 @@ def _side(
         direction = direction * np.sign(direction[-2:] @ (u[-2:] - centre))
         rows.append(_row_at(problem, track, u, track.seen_at(u)))
         seen_last = []
+
+
+def _where_it_ends(track: Track, last: CurvePoint, beyond: CurvePoint) -> np.ndarray:
+    """Both parameters where the motion ceases to exist, between the last point and one beyond,
+    where its equations may have turned back."""
+    length, known, ends = float((beyond.u - last.u) @ last.tangent), 0.0, 1.0
+    for _ in range(HALVINGS_TO_END):
+        part = 0.5 * (known + ends)
+        at = track.corrected(last.u, last.tangent, part * length)
+        exists = at.found and track.seen_at(at.u).exists
+        known, ends = (part, ends) if exists else (known, part)
+    return track.corrected(last.u, last.tangent, known * length).u[-2:]
 
 
 def _just_ahead(seen: list[tuple[CurvePoint, Seen]], step: float) -> list[SpecialPoint]:
