@@ -249,3 +249,31 @@ def test_a_branch_passes_corners_by_name():
             for way in (-1e-5, 1e-5)
         )
         assert len(set(sides)) == 2
+
+
+@pytest.mark.slow
+def test_a_curve_goes_on_where_events_change_whatever_its_step():
+    """At three places excursions over the belt's velocity appear or vanish, at one a stop does."""
+    law = jb.Stribeck(1.0, 0.6, 0.3)
+
+    def make(frequency, amplitude):
+        belt = jb.Belt(0.3, law, 0.5, upper=0.9)
+        return jb.Oscillator(0.1, (belt,), forcing=jb.Harmonic(amplitude, frequency))
+
+    grazing = jb.GrazingEdge(belt=0)
+    start = jb.find_cycle(make(1.5, 0.5), (0.3, 0.1))
+    point = jb.refine(grazing, lambda amplitude: make(1.5, amplitude), at=0.5, start=start)
+    span = (1.2, 2.2), (0.2, 1.2)
+    curves = [jb.bifurcation_curve(point, make, span, step=step) for step in (0.02, 0.013)]
+    for curve in curves:
+        assert [end.name for end in curve.ends] == ["LEFT_SPAN", "LEFT_SPAN"]
+        assert curve.values[[0, -1], 1] == pytest.approx(0.2, abs=1e-9)
+    (one, other) = ([(p.kind, *p.values) for p in curve.special] for curve in curves)
+    kinds = "SwitchingSliding Fold GrazingSliding SwitchingSliding SwitchingSliding"
+    assert [p[0] for p in one] == [p[0] for p in other] == kinds.split()
+    for a, b in zip(one, other):
+        assert a[1:] == pytest.approx(b[1:], abs=1e-12 if a[0] == "Fold" else 5e-5)
+    # Behind the place where a stop vanishes, by one parameter alone.
+    row = next(row for row in curves[0].values[::-1] if row[1] < 0.353 and row[0] < 1.55)
+    found = jb.refine(grazing, lambda f: make(f, row[1]), at=row[0] + 1e-3, start=point.cycle)
+    assert float(found.value) == pytest.approx(row[0], abs=1e-9)

@@ -36,8 +36,8 @@ from ..results import Status, draw
 from ..tables import table_of
 from .base import AbstractCondition, BifurcationPoint
 from .changes import CurveProblem, CurveRow, beyond_change
-from .forced import AbstractForcedCondition
-from .forced_ends import meeting_point
+from .forced import AbstractForcedCondition, UnitCircle
+from .forced_ends import border_at, meeting_point
 from .special import (
     CREEPS,
     SpecialPoint,
@@ -358,11 +358,13 @@ def _side(
         changes = leg.at_change
         if not points or end is Stop.STEP_TOO_SMALL:
             trail = trail._replace(end=Stop.STEP_TOO_SMALL)
-            # What is watched with forcing does not change the signature.
+            # What is watched with forcing does not change the signature; the curve of a multiplier
+            # ends where the signature does.
             is_forced = isinstance(problem.condition, AbstractForcedCondition)
             changes = [] if is_forced else _just_ahead(seen_last, problem.step)
             special += changes
-            if not changes:
+            goes_on = is_forced and not isinstance(problem.condition, UnitCircle)
+            if not changes and not (goes_on and points):
                 return _ended(problem, rows, special, trail)
         elif beyond is None and end is not Stop.POINT_COUNT:
             return _ended(problem, rows, special, trail)
@@ -371,12 +373,15 @@ def _side(
             track, u, direction = track.remeshed(last, points[-1][0].tangent)
             continue
         # The signature changes here, or between the last two points.
-        centre = last[-2:] if beyond is None else _where_it_ends(track, points[-1][0], beyond)
+        centre, error = last[-2:], SHORTEST_PART * problem.step
+        if beyond is not None:
+            centre, error = _where_it_ends(track, points[-1][0], beyond)
         centre = np.array(changes[-1].values) if changes else centre
         is_end = bool(changes) and problem.condition.ends_at_contact
         further = None if is_end else beyond_change(problem, track, rows, last, centre, changes)
         if further is None:
             return _ended(problem, rows, special, trail)
+        special += [] if changes else border_at(problem.condition, trail, centre, error)
         track, u = Track.begun(problem.variation, *further)
         direction = track.tangent(u)
         direction = direction * np.sign(direction[-2:] @ (u[-2:] - centre))
@@ -384,16 +389,16 @@ def _side(
         seen_last = []
 
 
-def _where_it_ends(track: Track, last: CurvePoint, beyond: CurvePoint) -> np.ndarray:
+def _where_it_ends(track: Track, last: CurvePoint, beyond: CurvePoint) -> tuple[np.ndarray, float]:
     """Both parameters where the motion ceases to exist, between the last point and one beyond,
-    where its equations may have turned back."""
+    where its equations may have turned back; and how well they are known."""
     length, known, ends = float((beyond.u - last.u) @ last.tangent), 0.0, 1.0
     for _ in range(HALVINGS_TO_END):
         part = 0.5 * (known + ends)
         at = track.corrected(last.u, last.tangent, part * length)
         exists = at.found and track.seen_at(at.u).exists
         known, ends = (part, ends) if exists else (known, part)
-    return track.corrected(last.u, last.tangent, known * length).u[-2:]
+    return track.corrected(last.u, last.tangent, known * length).u[-2:], (ends - known) * length
 
 
 def _just_ahead(seen: list[tuple[CurvePoint, Seen]], step: float) -> list[SpecialPoint]:

@@ -68,6 +68,31 @@ def meeting_point(condition: AbstractCondition, trail: Trail) -> SpecialPoint | 
     return min(found, key=lambda point: _from_last_row(trail, point.values), default=None)
 
 
+def border_at(
+    condition: AbstractCondition, trail: Trail, centre: np.ndarray, error: float
+) -> list[SpecialPoint]:
+    """The border that a forced motion meets on a curve where its signature changes.
+
+    trail: up to a point beside; centre, error: where it changes, and how well that is known.
+    """
+    if not isinstance(condition, AbstractForcedCondition):
+        return []
+    osc = trail.variation.oscillator(trail.values[-1])
+    motion = trail.system.motion(osc, trail.x)
+    others = [
+        border for border in borders_of(osc) if border.with_clock().lineage != condition.lineage
+    ]
+    distances = [
+        min((float(one.distance) for one in some), default=np.inf)
+        for some in (border.with_clock().beginnings_of(osc, motion) for border in others)
+    ]
+    if not distances or min(distances) > trail.step:
+        return []
+    border = others[int(np.argmin(distances))]
+    values = float(centre[0]), float(centre[1])
+    return [SpecialPoint(type(border).__name__, border.belts_concerned, values, error)]
+
+
 def _zeros_along(
     trail: Trail, condition: AbstractForcedCondition, motion: PeriodicMotion, kind: str
 ) -> Iterator[SpecialPoint]:

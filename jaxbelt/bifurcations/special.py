@@ -41,7 +41,8 @@ class SpecialPoint(NamedTuple):
     a saddle ceases to push away, and its connection ends), "MeetingEdges" (the saddles of a
     connection come together), "BeltAtRest", "EqualVelocities", or a function that your own
     condition watches. With forcing: a condition that holds, too ("PeriodDoubling", "Fold", "Torus",
-    "GrazingSliding", "CrossingSliding", "SwitchingSliding", "AddingSliding"), or a strong resonance
+    "GrazingSliding", "CrossingSliding", "SwitchingSliding", "AddingSliding", "GrazingEdge",
+    "CornerCollision"; the events of the motion change there), or a strong resonance
     ("Resonance1to1" to "Resonance1to4": the multipliers of a torus are 1 and 1, -1 and -1, third or
     fourth roots of 1; Y. A. Kuznetsov, Elements of Applied Bifurcation Theory, chapter 9).
 
