@@ -32,9 +32,9 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     sweeps/         clusters sweep shares
     sweeps/         naming forced_basins basins fractions orbit_diagram circle_map
     bifurcations/   special labels beside systems timed_systems guesses base conditions forced
-    bifurcations/   forced_edges tangencies crossings rests edge_rests edges folds meetings
+    bifurcations/   symmetry forced_edges tangencies crossings rests edge_rests edges folds meetings
     bifurcations/   connections infinity path scan refine tracks forced_ends changes curves cells
-    bifurcations/   faces bounds regions branches pieces diagrams switch_folds
+    bifurcations/   faces bounds regions legs branches pieces diagrams switch_folds
     inverse/        selection record search windows fit margins design
     si              results in SI units
     plotting/       style phase histories forced points diagrams regions categories sweeps orbits

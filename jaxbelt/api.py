@@ -28,6 +28,7 @@ from .bifurcations.regions import RegionMap, region_map
 from .bifurcations.rests import BeltAtRest, Hopf, SuddenSliding
 from .bifurcations.scan import scan
 from .bifurcations.special import SpecialPoint
+from .bifurcations.symmetry import SymmetryBreaking
 from .bifurcations.tangencies import GrazingSliding, NonsmoothFold
 from .cycles.cycle import Cycle, find_cycle
 from .cycles.exponents import Exponents, lyapunov
@@ -139,6 +140,7 @@ __all__ = [
     "Stribeck",
     "SuddenSliding",
     "SwitchingSliding",
+    "SymmetryBreaking",
     "Tabulated",
     "Torus",
     "Trajectory",

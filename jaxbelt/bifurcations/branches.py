@@ -11,30 +11,18 @@ one. At a period doubling the other branch that meets this one there is followed
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from ..activity import note_progress
-from ..cycles.clocked import TimedChain, timed_blocks
 from ..cycles.periodic import (
     PeriodicMotion,
-    begun_off_events,
     is_same_motion,
-    motion_at_unknowns,
     periodic_from,
-    state_at_phase_0,
     state_near_start,
 )
-from ..cycles.shooting import jacobian
 from ..model.events import of_one_loop
-from ..model.families import Family
-from ..model.own_units import OwnOscillator, in_own_units
-from ..model.variations import Variation
-from ..numerics.continuation import Corrected
+from ..model.own_units import OwnOscillator
 from ..results import Status
 from .base import AbstractCondition, BifurcationPoint
 from .edges import GrazingEdge
@@ -46,13 +34,12 @@ from .forced import (
     SwitchingSliding,
     Torus,
     friction_jumps,
-    motion_between_halves,
 )
 from .forced_ends import borders_of
-from .systems import WEIGHT
+from .legs import ForcedLine, MotionBranch, MotionLeg, MotionRow
+from .symmetry import SymmetryBreaking, asymmetry_of, image_of, is_symmetric
 from .tangencies import GrazingSliding
 from .timed_systems import unit_circle_tests
-from .tracks import corrected_among
 
 #: First, shortest and longest step, of which the parameter's part is measured in parts of the span.
 FIRST_STEP_OF_BRANCH, SHORTEST_STEP_OF_BRANCH, LONGEST_STEP_OF_BRANCH = 2e-3, 1e-7, 2e-2
@@ -62,8 +49,6 @@ SEARCH_AGAIN = 2e-3
 STRAIGHT_ROWS = 3
 #: Cosine of the largest angle between tangents of neighbours.
 STRAIGHT_BRANCH = 0.95
-#: How far along a tangent the state at the phase 0 is compared.
-SHORT_WAY = 1e-6
 #: Steps on each side at most.
 MOST_MOTIONS = 400
 #: So many times as large as the first motion of a branch, and 1, a motion grows beyond all bounds.
@@ -88,43 +73,11 @@ ALIKE_MULTIPLIERS = 0.1
 LEAVES = (1e-3, 1e-2, 5e-2)
 
 
-class MotionRow(NamedTuple):
-    """A motion of a branch and where it is."""
-
-    value: float
-    motion: PeriodicMotion
-
-
-class MotionBranch(NamedTuple):
-    """Motions along a branch, and values inside of the span at which it ends without a point; a
-    closed one comes back to its first motion."""
-
-    rows: list[MotionRow]
-    open_ends: list[float]
-    is_closed: bool = False
-
-
-class ForcedLine(NamedTuple):
-    """What is varied, and between which values."""
-
-    variation: Variation
-    first: float
-    last: float
-    turns: int
-
-    @property
-    def length(self) -> float:
-        return self.last - self.first
-
-    def at(self, value: float) -> OwnOscillator:
-        return in_own_units(self.variation.oscillator(np.array([value])))
-
-
 def forced_branches(
     line: ForcedLine, begun: MotionRow, further: Callable[[float], MotionRow | None] | None
 ) -> tuple[list[MotionBranch], list[BifurcationPoint]]:
     """The branch of a motion at a value, within a span, to both sides, and those that meet it in
-    period doublings; and the points on them. All in own units.
+    period doublings and where symmetry breaks; and the points on them. All in own units.
 
     further: finds a motion at a value that no branch reaches, whose branch is followed, too.
     """
@@ -132,6 +85,8 @@ def forced_branches(
     looked = 0
     while waiting:
         row, is_first = waiting.pop(0)
+        if any(_is_on_branch(line, row, one) for one in branches):
+            continue
         sides = [_side_of_point(line, row, -1.0)]
         around = sides[0][0].is_closed
         sides += [(MotionBranch([row], []), [])] if around else [_side_of_point(line, row, 1.0)]
@@ -142,15 +97,24 @@ def forced_branches(
             if any(_is_known_motion(point, one, line) for one in found):
                 continue
             found.append(point)
-            if is_first and isinstance(point.condition, PeriodDoubling):
-                other = _other_branch(line, point, row.motion)
-                waiting += [(other, False)] if other is not None else []
+            if is_first:
+                waiting += [(other, False) for other in _other_branches(line, point, row)]
         if further and not waiting and looked < MOST_FURTHER:
             looked += 1
             width, middle = _widest_gap(line, branches)
             other = further(middle) if width > WIDE_GAP * line.length else None
             waiting += [(other, True)] if other is not None else []
     return branches, sorted(found, key=lambda point: float(point.value))
+
+
+def _is_on_branch(line: ForcedLine, row: MotionRow, branch: MotionBranch) -> bool:
+    """Whether a motion is one of a branch."""
+    osc, other = line.at(row.value), branch.rows[len(branch.rows) // 2]
+    if line.is_symmetric and (
+        is_symmetric(osc, row.motion) != is_symmetric(line.at(other.value), other.motion)
+    ):  # Where they meet Newton's method goes from one to the other.
+        return False
+    return _has_passed(branch.rows, row.value, osc, row.motion)
 
 
 def _widest_gap(line: ForcedLine, branches: list[MotionBranch]) -> tuple[float, float]:
@@ -169,79 +133,7 @@ def _is_known_motion(point: BifurcationPoint, other: BifurcationPoint, line: For
     return bool(close and alike and is_same_motion(point.cycle, other.cycle))
 
 
-# --- one leg: a fixed signature -------------------------------------------------------------------
-
-
-class MotionLeg(NamedTuple):
-    """A fixed signature: its chain, and what the unknowns and the parameter are measured in."""
-
-    line: ForcedLine
-    chain: TimedChain
-    weights: Array
-
-    @classmethod
-    def of(cls, line: ForcedLine, row: MotionRow) -> tuple["MotionLeg", np.ndarray]:
-        z = np.asarray(row.motion.unknowns)
-        weights = WEIGHT / (1 + np.abs(z.reshape(-1)))
-        u = np.append(weights * z.reshape(-1), row.value / line.length)
-        return cls(line, row.motion.chain, jnp.asarray(weights)), u
-
-    @classmethod
-    def begun(cls, line: ForcedLine, row: MotionRow) -> tuple["MotionLeg", Corrected]:
-        """The leg of a row, and the unknowns and the tangent of the row, if they are found; its
-        chain begins off events."""
-        motion = begun_off_events(line.at(row.value), row.motion)
-        leg, u = cls.of(line, row._replace(motion=motion))
-        return leg, leg.corrected(u, np.eye(u.size)[-1], 0.0)
-
-    def corrected(self, u: np.ndarray, tangent: np.ndarray, length: float) -> Corrected:
-        """As `continuation.corrected`."""
-        units = np.array([self.line.length])
-        args = self.chain, self.weights, jnp.asarray(units[0])
-        given = _linearized_motion, args, units
-        return corrected_among(self.line.variation, *given, u, tangent, length)
-
-    def row(self, u: np.ndarray) -> MotionRow:
-        z = jnp.asarray(u[:-1] / np.asarray(self.weights)).reshape(-1, 4)
-        value = float(self.line.length * u[-1])
-        return MotionRow(value, motion_at_unknowns(self.line.at(value), self.chain, z))
-
-    def going_on(
-        self, row: MotionRow, u: np.ndarray, tangent: np.ndarray
-    ) -> tuple["MotionLeg", np.ndarray, np.ndarray]:
-        """The leg in the sizes of a row of it, and with the row's steps of integration; the row's
-        unknowns, and the tangent, in these sizes. Where an event has come near to the phase at
-        which the chain begins, it begins at another one."""
-        moved = row._replace(motion=begun_off_events(self.line.at(row.value), row.motion))
-        if moved.motion is not row.motion:
-            leg, begun = MotionLeg.begun(self.line, moved)
-            if begun.found:
-                same = leg._course(begun.u, begun.tangent) @ self._course(u, tangent) > 0
-                return leg, begun.u, begun.tangent if same else -begun.tangent
-        leg, u = MotionLeg.of(self.line, row)
-        tangent = tangent * np.append(np.asarray(leg.weights / self.weights), 1.0)
-        return leg, u, tangent / np.linalg.norm(tangent)
-
-    def _course(self, u: np.ndarray, tangent: np.ndarray) -> np.ndarray:
-        """How the state at the phase 0 and the parameter change along a tangent, wherever the chain
-        begins, [3]."""
-        ahead = u + SHORT_WAY * tangent
-        return np.append(self.start(ahead) - self.start(u), ahead[-1] - u[-1])
-
-    def start(self, u: np.ndarray) -> np.ndarray:
-        """The state at the phase 0, also of what is no motion."""
-        z = jnp.asarray(u[:-1] / np.asarray(self.weights)).reshape(-1, 4)
-        return state_at_phase_0(self.line.at(float(self.line.length * u[-1])), self.chain, z)
-
-
-def _linearized_motion(
-    u: Array, args: tuple[Family, TimedChain, Array, Array]
-) -> tuple[Array, Array]:
-    family, chain, weights, unit = args
-    z, p = (u[:-1] / weights).reshape(-1, 4), unit * u[-1:]
-    value, blocks = timed_blocks(family.at(p), jax.jacfwd(family.at)(p), chain, z)
-    own = jacobian(blocks[..., :4]) / weights[None]
-    return value.reshape(-1), jnp.append(own, unit * blocks[..., 4:].reshape(-1, 1), axis=1)
+# --- leg by leg -----------------------------------------------------------------------------------
 
 
 def _side_of_point(
@@ -300,9 +192,9 @@ def _branch_leg(
                 continue
             points += list(_points_between(line, last, at_end))
             return [*rows, at_end], points, None
-        doubling = _doubling_between(line, last, new)
-        if doubling is not None:
-            return rows, [*points, doubling], None
+        merging = _merging_between(line, last, new)
+        if merging is not None:
+            return rows, [*points, merging], None
         if int(new.motion.status) != Status.OK:
             start = leg.start(solved.u)
             if step < SEARCH_AGAIN * searched:
@@ -368,6 +260,8 @@ def _points_between(
             continue
         nearer = min((one, other), key=lambda row: abs(_tests(row.motion)[kind]))
         found = _points(line, kind(), nearer)
+        if kind is Fold and line.is_symmetric:
+            found = [*_points(line, SymmetryBreaking(), nearer), *found]
         start = np.asarray(other.motion.start)
         fine = [p for p in found if _is_between(line, p, one, other.value, start)]
         yield from fine[:1]
@@ -392,28 +286,32 @@ def _is_between(
     return abs(float(point.value) - one.value) <= reach and bool(away <= 5 * apart + 0.01)
 
 
-def _doubling_between(line: ForcedLine, last: MotionRow, new: MotionRow) -> BifurcationPoint | None:
-    """The period doubling in which a branch ends between two of its motions: behind it come its own
-    motions again, half of their periods later. So it has been passed where the halves of the new
-    one have changed places; and it is near where those of the last one are alike, and the new one
-    is not known, for Newton's method is singular there."""
-    halves = _apart(last.motion)
-    if halves is None:
-        return None
+def _merging_between(line: ForcedLine, last: MotionRow, new: MotionRow) -> BifurcationPoint | None:
+    """The point in which a branch ends between two of its motions, as behind it come its own again,
+    half of their periods later: those of a period doubling, and, as images, those that have left a
+    symmetric motion. So the point has been passed where both have changed places; and it is near
+    where both are alike, and the new motion is not known, for Newton's method is singular there."""
     is_known = int(new.motion.status) == Status.OK
-    ahead = _apart(new.motion) if is_known else None
-    if is_known and (ahead is None or np.sum(halves * ahead) >= 0):
-        return None
-    size = np.max(np.abs(halves))
-    if not is_known and size > ALIKE_HALVES:
-        return None
-    between = motion_between_halves(line.at(last.value), last.motion, line.turns)
-    if between is None:
-        return None
-    found = _points(line, PeriodDoubling(), MotionRow(last.value, between))
-    middle = np.mean(np.asarray(last.motion.starts)[:: last.motion.periods // 2], axis=0)
-    near = [p for p in found if np.max(np.abs(np.asarray(p.cycle.start) - middle)) < size]
-    return near[0] if near else None
+    for condition in (PeriodDoubling(), SymmetryBreaking()):
+        halves = _apart(line, condition, last)
+        if halves is None:
+            continue
+        ahead = _apart(line, condition, new) if is_known else None
+        if is_known and (ahead is None or np.sum(halves * ahead) >= 0):
+            continue
+        size = np.max(np.abs(halves))
+        if not is_known and size > ALIKE_HALVES:
+            continue
+        middle = np.asarray(last.motion.start) - 0.5 * halves[0]
+        periods = last.motion.periods // (2 if isinstance(condition, PeriodDoubling) else 1)
+        between = periodic_from(line.at(last.value), middle, periods, line.turns)
+        if int(between.status) != Status.OK:
+            continue
+        found = _points(line, condition, MotionRow(last.value, between))
+        near = [p for p in found if np.max(np.abs(np.asarray(p.cycle.start) - middle)) < size]
+        if near:
+            return near[0]
+    return None
 
 
 def _is_on_the_way(one: MotionRow, last: MotionRow, new: MotionRow) -> bool:
@@ -428,12 +326,18 @@ def _is_on_the_way(one: MotionRow, last: MotionRow, new: MotionRow) -> bool:
     return bool(0 <= part <= 1 and away <= STRAIGHT_WAY * np.max(np.abs(way)))
 
 
-def _apart(motion: PeriodicMotion) -> np.ndarray | None:
-    """How far the states at the phase 0 are from those half of the periods later, [periods, 2];
-    None where these are odd."""
-    half, odd = divmod(motion.periods, 2)
-    starts = np.asarray(motion.starts)
-    return None if odd else starts - np.roll(starts, -half, axis=0)
+def _apart(line: ForcedLine, condition: AbstractCondition, row: MotionRow) -> np.ndarray | None:
+    """How far the states at the phase 0 are from those half of the periods later, or from those of
+    the image, [states, 2]; None where the motion has not left another one in such a point."""
+    half, odd = divmod(row.motion.periods, 2)
+    if isinstance(condition, PeriodDoubling):
+        starts = np.asarray(row.motion.starts)
+        return None if odd else starts - np.roll(starts, -half, axis=0)
+    osc = line.at(row.value)
+    if not (odd and line.is_symmetric) or is_symmetric(osc, row.motion):
+        return None
+    away = asymmetry_of(osc, row.motion)
+    return None if away is None else away[None]
 
 
 def _past_corner(
@@ -561,19 +465,51 @@ def _jumps_at(point: BifurcationPoint) -> bool:
     return may_jump and friction_jumps(point.oscillator, int(condition.belt))
 
 
-def _other_branch(
-    line: ForcedLine, point: BifurcationPoint, motion: PeriodicMotion
-) -> MotionRow | None:
-    """A motion of the other branch that meets the branch of a motion in a period doubling: of twice
-    the periods, or the one that goes on where the motion has left it there."""
-    if point.cycle.periods < motion.periods:
-        return MotionRow(float(point.value), point.cycle)
-    return _leaving(line, point)
+def _other_branches(line: ForcedLine, point: BifurcationPoint, begun: MotionRow) -> list[MotionRow]:
+    """A motion each of the other branches that meet the branch of a motion in a point: of those
+    that leave there, or of the one that goes on where the motion has left it."""
+    value = float(point.value)
+    if isinstance(point.condition, PeriodDoubling):
+        goes_on = point.cycle.periods < begun.motion.periods
+        other = MotionRow(value, point.cycle) if goes_on else _leaving(line, point)
+        return [] if other is None else [other]
+    if not isinstance(point.condition, SymmetryBreaking):
+        return []
+    osc = line.at(begun.value)
+    goes_on = not is_symmetric(osc, begun.motion)
+    leaving = begun if goes_on else _leaving(line, point)
+    if leaving is None:
+        return []
+    osc = line.at(leaving.value)
+    image = MotionRow(leaving.value, image_of(osc, leaving.motion))
+    other = _beside(line, point) if goes_on else leaving
+    return [one for one in (other, image) if one is not None and _is_motion(one)]
+
+
+def _is_motion(row: MotionRow) -> bool:
+    return int(row.motion.status) == Status.OK
+
+
+def _beside(line: ForcedLine, point: BifurcationPoint) -> MotionRow | None:
+    """A symmetric motion beside a point in which asymmetric ones leave; at the point itself the
+    equations are singular."""
+    value, cycle = float(point.value), point.cycle
+    for side in (1.0, -1.0):
+        there = value + side * LEAVES[0] * line.length
+        if line.first <= there <= line.last:
+            osc = line.at(there)
+            motion = periodic_from(osc, np.asarray(cycle.start), cycle.periods, line.turns)
+            row = MotionRow(there, motion)
+            if _is_motion(row) and is_symmetric(osc, motion):
+                return row
+    return None
 
 
 def _leaving(line: ForcedLine, point: BifurcationPoint) -> MotionRow | None:
-    """A motion of twice the period beside a period doubling."""
-    value, periods = float(point.value), 2 * point.cycle.periods
+    """A motion that leaves another one, beside the point: of twice the period in a period doubling,
+    else an asymmetric one."""
+    value, doubles = float(point.value), isinstance(point.condition, PeriodDoubling)
+    periods = point.cycle.periods * (2 if doubles else 1)
     for share, size, side in itertools.product(SOME_PHASES, LEAVES, (1.0, -1.0)):
         at = state_near_start(line.at(value), point.cycle, share)
         there = value + side * size**2 * line.length
@@ -584,8 +520,10 @@ def _leaving(line: ForcedLine, point: BifurcationPoint) -> MotionRow | None:
             guess = at + size * np.array([np.cos(angle), np.sin(angle)])
             motion = periodic_from(osc, guess, periods, line.turns, share)
             row = MotionRow(there, motion)
-            fine = int(motion.status) == Status.OK and motion.periods == periods
+            fine = _is_motion(row) and motion.periods == periods
+            if not fine or (not doubles and is_symmetric(osc, motion)):
+                continue
             # Too near to the point the equations are singular.
-            if fine and MotionLeg.begun(line, row)[1].found:
+            if MotionLeg.begun(line, row)[1].found:
                 return row
     return None

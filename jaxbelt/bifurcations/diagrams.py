@@ -34,9 +34,10 @@ from ..numerics.compiling import compiled_beside
 from ..results import Status, draw
 from ..tables import per_belt, table_of
 from .base import BifurcationPoint, given_point
-from .branches import ForcedLine, MotionRow, forced_branches
+from .branches import forced_branches
 from .cells import in_plane_of_paper, region_name
 from .forced import motions_to_begin_from
+from .legs import ForcedLine, MotionRow
 from .path import ParameterPath
 from .pieces import (
     Branch,
@@ -47,6 +48,7 @@ from .pieces import (
     separated_stretches,
 )
 from .scan import by_value, calls_ahead, edges_touched, is_at_one_value, search
+from .symmetry import looks_the_same
 from .timed_systems import place_of_motion
 
 if TYPE_CHECKING:
@@ -257,7 +259,8 @@ def _forced_diagram(osc: Any, where: Any, span: Any, start: Any) -> BifurcationD
     limits = np.array([[first, last]]) / unit
     motion, value = _start_of_branch(variation, limits, start)
     turns = turns_of(motion.oscillator)
-    line = ForcedLine(variation, float(limits[0, 0]), float(limits[0, 1]), turns)
+    symmetric = all(looks_the_same(variation.oscillator(end), turns) for end in limits.T)
+    line = ForcedLine(variation, float(limits[0, 0]), float(limits[0, 1]), turns, symmetric)
 
     def further(value: float) -> MotionRow | None:
         motions = motions_to_begin_from(line.at(value), None, line.turns)

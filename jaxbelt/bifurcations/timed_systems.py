@@ -7,14 +7,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array
 
 from ..cycles.chains import first_failure
 from ..cycles.clocked import (
     TimedChain,
+    arc_maps,
     guard_slope,
     monodromy,
     monodromy_and_slopes,
+    states_at_phase,
     timed_blocks,
     timed_chain,
     timed_residual,
@@ -33,6 +36,8 @@ from .systems import PARTS_OF_ARC, AbstractChainSystem, Seen, Tests
 
 #: A multiplier that is off by less is the one that the condition asks for.
 ON_CIRCLE = 1e-6
+#: Motions are symmetric up to this part of their size.
+SYMMETRIC = 1e-8
 #: A motion comes to a boundary, and does not only touch it, if r goes to zero faster (own units).
 ARRIVES = 1e-6
 
@@ -149,6 +154,61 @@ class OnUnitCircle(TimedSystem):
         return first_failure(motion.status, fits, Status.OTHER_KIND)
 
 
+class OnBreakingSymmetry(OnUnitCircle):
+    """A symmetric motion has a multiplier 1, in a direction in which it is symmetric no longer.
+
+    Where symmetric and asymmetric motions meet the equations of a motion are singular, and those of
+    a symmetric one are not: the last mismatch along `direction`, which vanishes by symmetry, gives
+    way to how asymmetric the motion is, along it. direction: in which asymmetric motions leave,
+    about, [2].
+    """
+
+    direction: Array
+
+    def residual(self, osc, x):
+        return self._of_symmetric(super().residual(osc, x), self._asymmetry(osc, x))
+
+    def linearized(self, osc_of, x, p):
+        value, matrix = super().linearized(osc_of, x, p)
+        away, (by_x, by_p) = jax.value_and_grad(lambda x, p: self._asymmetry(osc_of(p), x), (0, 1))(
+            x, p
+        )
+        rows = self._of_symmetric(matrix, jnp.append(by_x.reshape(-1), by_p))
+        return self._of_symmetric(value, away), rows
+
+    def judge(self, osc, motion):
+        z = motion.unknowns
+        whole = jnp.max(jnp.abs(timed_residual(osc, self.chain, z)[-1]))
+        away = jnp.max(jnp.abs(asymmetry(osc, self.chain, z)))
+        fits = jnp.maximum(whole, away) < SYMMETRIC * (1 + jnp.max(jnp.abs(z[:, :2])))
+        fits = fits & (self._change_of_asymmetry(osc, z) > 1.0)
+        return first_failure(super().judge(osc, motion), fits, Status.OTHER_KIND)
+
+    def _change_of_asymmetry(self, osc: Oscillator, z: Array) -> Array:
+        """How asymmetric motions become in the direction of the multiplier 1, over how far their
+        start moves: 2 where asymmetric motions leave, 0 in a fold of symmetric ones."""
+        maps = arc_maps(osc, self.chain, z)
+
+        def times(moved, one):
+            return one @ moved, moved
+
+        last, entries = lax.scan(times, jnp.eye(3), maps)
+        off = last[:2, :2] - jnp.eye(2)
+        rows = jnp.stack([-off[:, 1], off[:, 0]], axis=1)
+        along = rows[jnp.argmax(jnp.sum(rows**2, axis=1))]
+        moved = jnp.pad(entries[:, :, :2] @ along, ((0, 0), (0, 1)))
+        found = jax.jvp(lambda z: asymmetry(osc, self.chain, z), (z,), (moved,))[1]
+        return jnp.linalg.norm(found) / jnp.linalg.norm(along)
+
+    def _asymmetry(self, osc: Oscillator, z: Array) -> Array:
+        return jnp.dot(self.direction, asymmetry(osc, self.chain, z))
+
+    def _of_symmetric(self, rows: Array, row: Array) -> Array:
+        at = self.chain.ends.size * 4 - 4
+        across = self.direction[0] * rows[at + 1] - self.direction[1] * rows[at]
+        return rows.at[at].set(across).at[at + 1].set(row)
+
+
 class Touching(TimedSystem):
     """r = 0 at the end of the arc `row`, at which r' = 0."""
 
@@ -196,6 +256,18 @@ def unit_circle_tests(motion: PeriodicMotion) -> dict[str, Array]:
     is_pair = jnp.imag(motion.multipliers[0]) != 0
     torus = jnp.where(is_pair, det - 1, jnp.nan)
     return {"PeriodDoubling": 1 + trace + det, "Fold": 1 - trace + det, "Torus": torus}
+
+
+def asymmetry(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
+    """The sum of the states where a chain of an odd number of periods begins and half of its time
+    later, [2]: zero of a motion that is its own image under x1 -> -x1, half of its time later."""
+    share = jnp.zeros(()) if chain.share is None else chain.share
+    later = states_at_phase(osc, chain, z, (share + 0.5) % 1.0)
+    passes = ~jnp.isnan(later[:, 0])
+    middle = (jnp.sum(passes) - 1) // 2
+    is_half_way = passes & (jnp.cumsum(passes) - 1 == middle)
+    half_way = jnp.where(is_half_way[:, None], later, 0.0)
+    return z[0, :2] + jnp.sum(half_way, axis=0)
 
 
 def _trace_and_determinant(motion: PeriodicMotion) -> tuple[Array, Array]:

@@ -380,16 +380,16 @@ def begun_off_events(osc: Oscillator, motion: PeriodicMotion) -> PeriodicMotion:
 
 
 def state_near_start(
-    osc: Oscillator, motion: PeriodicMotion, share: float, *, before: bool = False
+    osc: Oscillator, motion: PeriodicMotion, share: float, *, before: bool = False, later: int = 0
 ) -> np.ndarray:
     """The state of a motion at a share of a period, the first one after `motion.start`, or the last
-    one before it."""
+    one before it, or so many periods later."""
     chain = motion.chain
     states = np.asarray(_passing_states(osc, chain, motion.unknowns, jnp.asarray(share)))
     passes = np.flatnonzero(np.isfinite(states[:, 0]))
     # Whether the first of them is before the first phase 0 of the chain.
     is_first = chain.share is not None and share >= float(chain.share)
-    place = (0 if is_first else -1) if before else int(is_first) % len(passes)
+    place = (0 if is_first else -1) if before else (int(is_first) + later) % len(passes)
     return states[passes[place]]
 
 
