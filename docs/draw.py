@@ -389,6 +389,13 @@ def on_a_cubic_belt(nu: float) -> jb.Oscillator:
     return jb.Oscillator(0.0, belts, forcing=jb.Harmonic(0.05, 1.7))
 
 
+def between_two_belts(frequency: float) -> jb.Oscillator:
+    """A mass that is pushed, between belts that run in opposite directions."""
+    law = jb.Stribeck(1.0, 0.5, 0.3)
+    belts = jb.Belt(0.5, law, load=0.2), jb.Belt(-0.5, law, load=0.2)
+    return jb.Oscillator(0.05, belts, forcing=jb.Harmonic(1.0, frequency))
+
+
 FORCED = {
     "PeriodDoubling": ForcedCase(
         *(jb.PeriodDoubling(), jb.presets.di_bernardo, r"\Omega"),
@@ -396,6 +403,9 @@ FORCED = {
     ),
     "Fold": ForcedCase(
         *(jb.Fold(), jb.presets.di_bernardo, r"\Omega", 1.68, 1.67, 1.69, (0.5, 0.0)),
+    ),
+    "SymmetryBreaking": ForcedCase(
+        *(jb.SymmetryBreaking(), between_two_belts, r"\Omega", 0.476, 0.47, 0.49, (0.5, 0.2)),
     ),
     "Torus": ForcedCase(
         *(jb.Torus(), on_a_cubic_belt, r"\nu_0", 1.07, 1.1, 1.04, (1.4, 0.0)),

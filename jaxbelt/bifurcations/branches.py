@@ -482,7 +482,7 @@ def _other_branches(line: ForcedLine, point: BifurcationPoint, begun: MotionRow)
         return []
     osc = line.at(leaving.value)
     image = MotionRow(leaving.value, image_of(osc, leaving.motion))
-    other = _beside(line, point) if goes_on else leaving
+    other = _symmetric_beside(line, point) if goes_on else leaving
     return [one for one in (other, image) if one is not None and _is_motion(one)]
 
 
@@ -490,7 +490,7 @@ def _is_motion(row: MotionRow) -> bool:
     return int(row.motion.status) == Status.OK
 
 
-def _beside(line: ForcedLine, point: BifurcationPoint) -> MotionRow | None:
+def _symmetric_beside(line: ForcedLine, point: BifurcationPoint) -> MotionRow | None:
     """A symmetric motion beside a point in which asymmetric ones leave; at the point itself the
     equations are singular."""
     value, cycle = float(point.value), point.cycle

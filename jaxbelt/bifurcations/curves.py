@@ -363,8 +363,8 @@ def _side(
             is_forced = isinstance(problem.condition, AbstractForcedCondition)
             changes = [] if is_forced else _just_ahead(seen_last, problem.step)
             special += changes
-            goes_on = is_forced and not isinstance(problem.condition, UnitCircle)
-            if not changes and not (goes_on and points):
+            goes_on = is_forced and not isinstance(problem.condition, UnitCircle) and points
+            if not changes and not (goes_on and meeting_point(problem.condition, trail) is None):
                 return _ended(problem, rows, special, trail)
         elif beyond is None and end is not Stop.POINT_COUNT:
             return _ended(problem, rows, special, trail)

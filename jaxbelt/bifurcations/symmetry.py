@@ -21,7 +21,7 @@ from .forced import ArcRows, Beginning, UnitCircle
 from .timed_systems import SYMMETRIC, OnBreakingSymmetry
 
 #: Parts of a period at which an oscillator is compared with its image, and how exactly.
-SOME_PARTS, SAME_NUMBERS = (0.0, 0.13, 0.37, 0.71), 1e-12
+SAMPLED_PARTS, ROUNDING_OF_BELTS = (0.0, 0.13, 0.37, 0.71), 1e-12
 
 
 class SymmetryBreaking(UnitCircle):
@@ -86,21 +86,21 @@ def image_of(osc: Oscillator, motion: PeriodicMotion) -> PeriodicMotion:
 def looks_the_same(osc: Oscillator, turns: int) -> bool:
     """Whether an oscillator is its own image half of a period of the forcing later."""
     period = float(forcing_period(osc, turns))
-    for part in SOME_PARTS:
+    for part in SAMPLED_PARTS:
         now, later = (at_time(osc, jnp.asarray((part + p) * period)) for p in (0.0, 0.5))
         pushes = [float(sum(constant_force(one))) for one in (now, later)]
-        images = [_as_numbers(belt, -1.0) for belt in later.belts]
-        for belt in (_as_numbers(belt, 1.0) for belt in now.belts):
-            same = next((one for one in images if _is_same(belt, one)), None)
+        images = [_belt_or_image(belt, -1.0) for belt in later.belts]
+        for belt in (_belt_or_image(belt, 1.0) for belt in now.belts):
+            same = next((one for one in images if _is_equal_belt(belt, one)), None)
             if same is None:
                 return False
             images.remove(same)
-        if abs(sum(pushes)) > SAME_NUMBERS * (1 + abs(pushes[0])):
+        if abs(sum(pushes)) > ROUNDING_OF_BELTS * (1 + abs(pushes[0])):
             return False
     return True
 
 
-def _as_numbers(belt, way: float) -> tuple:
+def _belt_or_image(belt, way: float) -> tuple:
     """What a belt, or its image (way -1), is at an instant."""
     edges = (belt.lower, belt.upper) if way > 0 else (-belt.upper, -belt.lower)
     law, structure = jax.tree.flatten(belt.friction)
@@ -108,6 +108,8 @@ def _as_numbers(belt, way: float) -> tuple:
     return structure, tuple(float(x) for leaf in numbers for x in np.ravel(leaf))
 
 
-def _is_same(one: tuple, other: tuple) -> bool:
+def _is_equal_belt(one: tuple, other: tuple) -> bool:
     numbers = np.array(one[1]), np.array(other[1])
-    return one[0] == other[0] and np.allclose(*numbers, rtol=SAME_NUMBERS, atol=SAME_NUMBERS)
+    return one[0] == other[0] and np.allclose(
+        *numbers, rtol=ROUNDING_OF_BELTS, atol=ROUNDING_OF_BELTS
+    )

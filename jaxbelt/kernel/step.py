@@ -190,7 +190,9 @@ def _(primals, tangents):
     more division keeps their sum."""
     osc, signs, pulls, ones, _, x2 = primals
     d_osc, _, d_pulls, _, d_x1, d_x2 = tangents
-    pushed = _changed(osc.forcing, d_osc.forcing, lambda forces: [one.push for one in forces])
+    pushed = _value_and_change(
+        osc.forcing, d_osc.forcing, lambda forces: [one.push for one in forces]
+    )
     pushes = [(1.0, d_push) for d_push in pushed[1]] if pushed else []
     total = _sum_of_changes((-1.0, d_x1), (-osc.damping, d_x2), (-x2, d_osc.damping), *pushes)
     forces = zip(osc.belts, d_osc.belts, signs, pulls, d_pulls, strict=True)
@@ -202,7 +204,7 @@ def _(primals, tangents):
         relative = ((1.0, d_belt.velocity), (-osc.omega, d_x2), (-x2, d_osc.omega))
         total = total + slope * _sum_of_changes(*relative)
         total = total + _sum_of_changes((top * bottom / square, d_pull))
-        if changed := _changed(law, d_belt.friction, methodcaller("fraction", speed)):
+        if changed := _value_and_change(law, d_belt.friction, methodcaller("fraction", speed)):
             (top, bottom), (d_top, d_bottom) = changed
             total = total + pull * ((d_top * bottom - top * d_bottom) / square)
     return as_quotient(*primals), materialise(total, ones)
@@ -214,7 +216,9 @@ def _sum_of_changes(*pairs: tuple[Any, Any]) -> Any:
     return functools.reduce(jnp.add, known) if known else 0.0
 
 
-def _changed(tree: Any, change: Any, function: Callable[[Any], Any]) -> tuple[Any, Any] | None:
+def _value_and_change(
+    tree: Any, change: Any, function: Callable[[Any], Any]
+) -> tuple[Any, Any] | None:
     """A function of a tree and how it changes with it; None where nothing of the tree changes."""
     leaves, structure = jax.tree.flatten(tree)
     changes = jax.tree.leaves(change)
