@@ -304,10 +304,15 @@ def _merging_between(line: ForcedLine, last: MotionRow, new: MotionRow) -> Bifur
             continue
         middle = np.asarray(last.motion.start) - 0.5 * halves[0]
         periods = last.motion.periods // (2 if isinstance(condition, PeriodDoubling) else 1)
-        between = periodic_from(line.at(last.value), middle, periods, line.turns)
-        if int(between.status) != Status.OK:
+        if isinstance(condition, PeriodDoubling):
+            between = MotionRow(
+                last.value, periodic_from(line.at(last.value), middle, periods, line.turns)
+            )
+        else:
+            between = _symmetric_beside(line, last.value, middle, periods)
+        if between is None or not _is_motion(between):
             continue
-        found = _points(line, condition, MotionRow(last.value, between))
+        found = _points(line, condition, between)
         near = [p for p in found if np.max(np.abs(np.asarray(p.cycle.start) - middle)) < size]
         if near:
             return near[0]
@@ -324,6 +329,21 @@ def _is_on_the_way(one: MotionRow, last: MotionRow, new: MotionRow) -> bool:
     way = after - before
     away = np.max(np.abs(at - before - part * way))
     return bool(0 <= part <= 1 and away <= STRAIGHT_WAY * np.max(np.abs(way)))
+
+
+def _symmetric_beside(
+    line: ForcedLine, value: float, start: np.ndarray, periods: int
+) -> MotionRow | None:
+    """A symmetric motion with about that start, beside a value: where asymmetric ones leave it the
+    equations are singular."""
+    for shift in (LEAVES[0], -LEAVES[0]):
+        there = value + shift * line.length
+        if line.first <= there <= line.last:
+            osc = line.at(there)
+            row = MotionRow(there, periodic_from(osc, start, periods, line.turns))
+            if _is_motion(row) and is_symmetric(osc, row.motion):
+                return row
+    return None
 
 
 def _apart(line: ForcedLine, condition: AbstractCondition, row: MotionRow) -> np.ndarray | None:
@@ -468,46 +488,33 @@ def _jumps_at(point: BifurcationPoint) -> bool:
 def _other_branches(line: ForcedLine, point: BifurcationPoint, begun: MotionRow) -> list[MotionRow]:
     """A motion each of the other branches that meet the branch of a motion in a point: of those
     that leave there, or of the one that goes on where the motion has left it."""
-    value = float(point.value)
+    value, cycle = float(point.value), point.cycle
     if isinstance(point.condition, PeriodDoubling):
-        goes_on = point.cycle.periods < begun.motion.periods
-        other = MotionRow(value, point.cycle) if goes_on else _leaving(line, point)
+        goes_on = cycle.periods < begun.motion.periods
+        other = MotionRow(value, cycle) if goes_on else next(_leaving(line, point), None)
         return [] if other is None else [other]
     if not isinstance(point.condition, SymmetryBreaking):
         return []
-    osc = line.at(begun.value)
-    goes_on = not is_symmetric(osc, begun.motion)
-    leaving = begun if goes_on else _leaving(line, point)
-    if leaving is None:
-        return []
-    osc = line.at(leaving.value)
-    image = MotionRow(leaving.value, image_of(osc, leaving.motion))
-    other = _symmetric_beside(line, point) if goes_on else leaving
-    return [one for one in (other, image) if one is not None and _is_motion(one)]
+    if not is_symmetric(line.at(begun.value), begun.motion):
+        symmetric = _symmetric_beside(line, value, np.asarray(cycle.start), cycle.periods)
+        return [one for one in (symmetric, _image(line, begun)) if one is not None]
+    pairs = ((one, _image(line, one)) for one in _leaving(line, point))
+    return next(([one, image] for one, image in pairs if image is not None), [])
+
+
+def _image(line: ForcedLine, row: MotionRow) -> MotionRow | None:
+    """The image of an asymmetric motion, if a branch can begin with it."""
+    image = MotionRow(row.value, image_of(line.at(row.value), row.motion))
+    return image if _is_motion(image) and MotionLeg.begun(line, image)[1].found else None
 
 
 def _is_motion(row: MotionRow) -> bool:
     return int(row.motion.status) == Status.OK
 
 
-def _symmetric_beside(line: ForcedLine, point: BifurcationPoint) -> MotionRow | None:
-    """A symmetric motion beside a point in which asymmetric ones leave; at the point itself the
-    equations are singular."""
-    value, cycle = float(point.value), point.cycle
-    for side in (1.0, -1.0):
-        there = value + side * LEAVES[0] * line.length
-        if line.first <= there <= line.last:
-            osc = line.at(there)
-            motion = periodic_from(osc, np.asarray(cycle.start), cycle.periods, line.turns)
-            row = MotionRow(there, motion)
-            if _is_motion(row) and is_symmetric(osc, motion):
-                return row
-    return None
-
-
-def _leaving(line: ForcedLine, point: BifurcationPoint) -> MotionRow | None:
-    """A motion that leaves another one, beside the point: of twice the period in a period doubling,
-    else an asymmetric one."""
+def _leaving(line: ForcedLine, point: BifurcationPoint) -> Iterator[MotionRow]:
+    """Motions that leave another one, beside the point: of twice the period in a period doubling,
+    else asymmetric ones."""
     value, doubles = float(point.value), isinstance(point.condition, PeriodDoubling)
     periods = point.cycle.periods * (2 if doubles else 1)
     for share, size, side in itertools.product(SOME_PHASES, LEAVES, (1.0, -1.0)):
@@ -525,5 +532,4 @@ def _leaving(line: ForcedLine, point: BifurcationPoint) -> MotionRow | None:
                 continue
             # Too near to the point the equations are singular.
             if MotionLeg.begun(line, row)[1].found:
-                return row
-    return None
+                yield row
