@@ -103,6 +103,33 @@ def test_branches_of_symmetric_and_asymmetric_motions_meet(point, at):
     assert abs(one.x1_max[-1] - image.x1_max[-1]) > 0.01
 
 
+def between_edges(frequency):
+    """A mass that touches two belts at +-0.8, and is free between."""
+    law = jb.Coulomb(1.0, 0.8)
+    belts = jb.Belt(0.35, law, 0.5, upper=-0.8), jb.Belt(-0.35, law, 0.5, lower=0.8)
+    return jb.Oscillator(DAMPING, belts, forcing=jb.Harmonic(0.5, frequency))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("at", [0.5, 0.62])
+def test_a_symmetric_motion_touches_edges_on_both_sides(at):
+    """It goes on beyond both; beyond one of them there is an asymmetric motion, and its image."""
+    start = jb.find_cycle(between_edges(at), (-0.8, 0.35))
+    diagram = jb.bifurcation_diagram(between_edges, span=(0.5, 0.62), start=start)
+    # The free motion has the amplitude 0.8.
+    squares = np.roots([1.0, DAMPING**2 - 2, 1 - (0.5 / 0.8) ** 2])
+    (grazing,) = (p for p in diagram.points if p.kind == "GrazingEdge")
+    assert float(grazing.value) == pytest.approx(np.sqrt(np.min(squares)), abs=1e-11)
+    folds = [float(p.value) for p in diagram.points if p.kind == "Fold"]
+    assert len(folds) == len(diagram.points) - 1 == 2
+    assert folds[0] == pytest.approx(folds[1], abs=1e-10)
+    widths = [(one.x1_min, one.x1_max) for one in diagram.branches]
+    symmetric = [np.max(np.abs(low + high)) < 1e-7 for low, high in widths]
+    assert sorted(symmetric) == [False, False, True]
+    ends = {round(float(one.values[k]), 9) for one in diagram.branches for k in (0, -1)}
+    assert {0.5, 0.62} <= ends and diagram.open_ends == ()
+
+
 @pytest.mark.slow
 def test_a_curve_in_two_parameters_is_the_same_in_either_order(point):
     spans = (0.47, 0.485), (0.9, 1.1)

@@ -413,6 +413,8 @@ def _through_point(
     goes on from there, see `_beyond_point`."""
     last, end = rows[-1], MotionRow(float(point.value), point.cycle)
     beyond, further = [], None
+    if _breaks_symmetry(line, point) and not is_symmetric(line.at(last.value), last.motion):
+        return [*_points_between(line, last, end), point], None
     if isinstance(point.condition, GrazingEdge):
         # Those that go beyond the edge lie off by the root of the distance.
         beyond = point.condition.with_clock().motions_beyond(line.variation, point)
@@ -493,19 +495,43 @@ def _other_branches(line: ForcedLine, point: BifurcationPoint, begun: MotionRow)
         goes_on = cycle.periods < begun.motion.periods
         other = MotionRow(value, cycle) if goes_on else next(_leaving(line, point), None)
         return [] if other is None else [other]
-    if not isinstance(point.condition, SymmetryBreaking):
+    if not _breaks_symmetry(line, point):
         return []
     if not is_symmetric(line.at(begun.value), begun.motion):
         symmetric = _symmetric_beside(line, value, np.asarray(cycle.start), cycle.periods)
         return [one for one in (symmetric, _image(line, begun)) if one is not None]
-    pairs = ((one, _image(line, one)) for one in _leaving(line, point))
+    touches = isinstance(point.condition, GrazingEdge)
+    leaving = _asymmetric_beyond(line, point) if touches else _leaving(line, point)
+    pairs = ((one, _image(line, one)) for one in leaving)
     return next(([one, image] for one, image in pairs if image is not None), [])
+
+
+def _breaks_symmetry(line: ForcedLine, point: BifurcationPoint) -> bool:
+    """Whether asymmetric motions leave a symmetric one in a point: also where it touches edges on
+    both sides."""
+    if isinstance(point.condition, SymmetryBreaking):
+        return True
+    touches = line.is_symmetric and isinstance(point.condition, GrazingEdge)
+    return touches and is_symmetric(line.at(float(point.value)), point.cycle)
+
+
+def _asymmetric_beyond(line: ForcedLine, point: BifurcationPoint) -> Iterator[MotionRow]:
+    """Motions that go beyond one of the edges that a symmetric motion touches."""
+    for one in point.condition.with_clock().motions_beyond(line.variation, point):
+        row = MotionRow(float(one.value), one.cycle)
+        if not is_symmetric(line.at(row.value), row.motion) and _begins(line, row):
+            yield row
+
+
+def _begins(line: ForcedLine, row: MotionRow) -> bool:
+    """Whether a branch can begin with a motion: too near to some points equations are singular."""
+    return _is_motion(row) and bool(MotionLeg.begun(line, row)[1].found)
 
 
 def _image(line: ForcedLine, row: MotionRow) -> MotionRow | None:
     """The image of an asymmetric motion, if a branch can begin with it."""
     image = MotionRow(row.value, image_of(line.at(row.value), row.motion))
-    return image if _is_motion(image) and MotionLeg.begun(line, image)[1].found else None
+    return image if _begins(line, image) else None
 
 
 def _is_motion(row: MotionRow) -> bool:

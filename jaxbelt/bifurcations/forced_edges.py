@@ -6,6 +6,7 @@ the edge, where its belt comes or goes, it has one more arc, which lasts for the
 distance: that is left out. In a corner an edge and a boundary, or slip onset, come together.
 """
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -15,6 +16,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..cycles.clocked import TimedChain
+from ..cycles.periodic import PeriodicMotion
 from ..cycles.shooting import end_guard
 from ..model.forcing import Oscillating
 from ..model.modes import STUCK, edges, mode_acceleration, mode_of
@@ -29,8 +31,8 @@ from .timed_systems import ARRIVES, TimedSystem
 
 #: How long a motion is to be beyond an edge behind the point where it touches it, in own units.
 EXCURSIONS = (3e-2, 1e-2, 3e-3)
-#: A motion this near to an edge touches it.
-ON_THE_EDGE = 1e-6
+#: A motion this near to an edge touches it; between the steps of one it may.
+ON_THE_EDGE, MAY_TOUCH = 1e-6, 1e-2
 
 
 class TwoEvents(TimedSystem):
@@ -68,7 +70,7 @@ class AbstractTimedEdge(AbstractForcedCondition):
         n, places = len(osc.belts), _edge_places(osc)
         for edge in (self.belt, n + self.belt):
             if np.isfinite(places[edge]):
-                yield n + edge, n + np.flatnonzero(places == places[edge])
+                yield n + edge, _at_same_place(osc, n + edge)
 
 
 def _both(
@@ -102,16 +104,24 @@ class TimedEdgeGrazing(AbstractTimedEdge):
     def motions_beyond(
         self, variation: Variation, point: BifurcationPoint
     ) -> Iterator[BifurcationPoint]:
-        """Motions that go beyond the edge for a short time, and the values at which they do."""
+        """Motions that go beyond the edge for a short time, and the values at which they do.
+
+        Of one that touches other edges, too, as symmetric ones do, at first those that go beyond
+        all of them.
+        """
         value = np.array([float(point.value)])
         osc, rows = in_own_units(variation.oscillator(value)), ArcRows.of(point.cycle)
-        for edge, same in self.ends_of_edges(osc):
+        for edge, _ in self.ends_of_edges(osc):
             for row in _turning(rows):
-                for duration in EXCURSIONS:
-                    beyond = _with_excursion(osc, rows, row, edge, same, duration)
-                    if beyond is None or _off_edge(osc, rows, row, edge) > ON_THE_EDGE:
+                if _off_edge(osc, rows, row, edge) > ON_THE_EDGE:
+                    continue
+                touched = _touching_all(osc, point.cycle, row, edge)
+                ways = [touched] * (len(touched[1]) > 1) + [(rows, [(row, edge)])]
+                for (cut, touches), duration in itertools.product(ways, EXCURSIONS):
+                    beyond = _with_excursions(osc, cut, touches, duration)
+                    if beyond is None:
                         continue
-                    numbers = jnp.asarray(row + 1), jnp.asarray(duration)
+                    numbers = jnp.asarray(touches[0][0] + 1), jnp.asarray(duration)
 
                     def system(chain, numbers=numbers):
                         return ArcOfDuration(chain, *numbers)
@@ -164,6 +174,39 @@ class TimedCorner(AbstractTimedEdge):
             yield from ((before, belt) for belt in np.flatnonzero(touched).tolist())
 
 
+def _touching_all(
+    osc: Oscillator, motion: PeriodicMotion, row: int, edge: int
+) -> tuple[ArcRows, list[tuple[int, int]]]:
+    """The arcs of a motion, cut where it touches other edges than that one, at which the arc of a
+    row ends; and the rows that end on edges, with these, in order."""
+    rows, names, n = ArcRows.of(motion), Ends(len(osc.belts)), len(osc.belts)
+    places, known, others = _edge_places(osc), _at_same_place(osc, edge).tolist(), []
+    for other in (n + np.flatnonzero(np.isfinite(places))).tolist():
+        if other in known:
+            continue
+        known += _at_same_place(osc, other).tolist()
+        for at, since, state, value in minima_of_guards(osc, motion, slice(other, other + 1)):
+            if value < MAY_TOUCH:
+                others.append((at, since, np.array([places[other - n], 0.0, state[2]]), other))
+    touches, own = [], row
+    for cuts, (at, since, state, end) in enumerate(sorted(others, key=lambda one: one[:2])):
+        rows = rows.cut(at + cuts, since, state, names.extremum_x1)
+        touches.append((at + cuts, end))
+        own += at <= row
+    return rows, sorted([*touches, (own, edge)])
+
+
+def _with_excursions(
+    osc: Oscillator, rows: ArcRows, touches: list[tuple[int, int]], duration: float
+) -> ArcRows | None:
+    """`_with_excursion` for all rows that touch edges, which are in order."""
+    beyond: ArcRows | None = rows
+    for row, edge in reversed(touches):
+        same = _at_same_place(osc, edge)
+        beyond = beyond and _with_excursion(osc, beyond, row, edge, same, duration)
+    return beyond
+
+
 def _with_excursion(
     osc: Oscillator, rows: ArcRows, row: int, edge: int, same: np.ndarray, duration: float
 ) -> ArcRows | None:
@@ -206,6 +249,12 @@ def _is_excursion(rows: ArcRows, row: int, ends: np.ndarray) -> bool:
     """Whether an arc begins and ends on an edge, and the one before it goes on behind it."""
     passes = rows.ends[row - 1] in ends and rows.ends[row] in ends
     return bool(passes and np.array_equal(rows.codes[row - 1], rows.codes[row + 1]))
+
+
+def _at_same_place(osc: Oscillator, end: int) -> np.ndarray:
+    """The numbers in `Ends` of all edges at the place of one."""
+    n, places = len(osc.belts), _edge_places(osc)
+    return n + np.flatnonzero(places == places[end - n])
 
 
 def _edge_places(osc: Oscillator) -> np.ndarray:

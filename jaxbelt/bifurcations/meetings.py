@@ -184,17 +184,28 @@ class EdgesAtRest(RestSystem):
         left = contact(osc, ends[0], rest, rightward=False)
         right = contact(osc, ends[1], rest, rightward=True)
         found = []
-        for passed in self.belts:
+        passed_first = (self.belts[0], self.pair.first), (self.belts[1], self.pair.second)
+        for (passed, edge), (other, _) in zip(passed_first, reversed(passed_first), strict=True):
             # Between them the belt whose edge comes first has the contact that it has to the right
-            # of both.
+            # of both, and so have equal ones.
+            equal = _equal_belts(osc, passed, edge)
             codes = [
-                jnp.where(passed == number, after, before)
+                jnp.where(equal[number] & (number != other), after, before)
                 for number, (before, after) in enumerate(zip(left.codes, right.codes, strict=True))
             ]
             pushes = [_push(osc, mode, ends[0]) for mode in (left, Mode(tuple(codes)), right)]
             focus = [(a > 0) & (b < 0) for a, b in pairwise(pushes)]
             found += [*focus, pushes[1] == 0]
         return any_of(found) & _both_rub(osc, self.belts)
+
+
+def _equal_belts(osc: Oscillator, belt: int | Array, edge: Array) -> list[Array]:
+    """Which belts have the velocity of one, and the edge of that number, on their same side."""
+    n, positions = len(osc.belts), jnp.stack(edges(osc))
+    velocities = jnp.stack([jnp.asarray(one.velocity) for one in osc.belts])
+    sides = positions.reshape(2, n)[edge // n]
+    same = (velocities == velocities[belt]) & (sides == positions[edge])
+    return [same[number] for number in range(n)]
 
 
 def _push(osc: Oscillator, mode: Mode, x1: Array) -> Array:

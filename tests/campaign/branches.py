@@ -23,7 +23,8 @@ import jaxbelt as jb
 from . import forced_cases, forced_package
 from .outcome import Outcome
 
-#: Structures without edges and with them, with one belt and two.
+#: Structures without edges and with them, with one belt and two; of the last ones the second belt
+#: is the image of the first, so that there are symmetric motions.
 STRUCTURES = tuple(
     forced_cases.Structure(laws, edges, 1, (False,) * len(laws), (False,) * len(laws))
     for laws, edges in (
@@ -34,8 +35,11 @@ STRUCTURES = tuple(
         (("conti", "coulomb"), False),
         (("conti",), True),
         (("coulomb", "coulomb"), True),
+        (("stribeck", "stribeck"), False),
+        (("coulomb", "coulomb"), True),
     )
 )
+SYMMETRIC = len(STRUCTURES) - 2
 #: Rows are the engine's up to this; of unstable ones times their growth.
 SAME = 1e-8
 #: Nearer to one than this no modulus of a multiplier says whether a row is stable.
@@ -76,6 +80,10 @@ def outcome(options, number: int) -> Outcome:
     structure = STRUCTURES[number % len(STRUCTURES)]
     case = forced_cases.case(rng, structure)
     osc, parameter = case.oscillator, str(rng.choice(PARAMETERS))
+    if number % len(STRUCTURES) >= SYMMETRIC:
+        belt = osc.belts[0]
+        image = replace(belt, velocity=-belt.velocity, lower=-belt.upper, upper=-belt.lower)
+        osc, parameter = replace(osc, belts=(belt, image)), str(rng.choice(PARAMETERS[:2]))
     value = osc.belts[0].velocity if parameter == "velocity" else vars(osc.forces[0])[parameter]
     off = 0.3 if parameter == "velocity" else 0.25 * value
     given = forced_package.oscillator(osc)
