@@ -309,7 +309,7 @@ def _merging_between(line: ForcedLine, last: MotionRow, new: MotionRow) -> Bifur
                 last.value, periodic_from(line.at(last.value), middle, periods, line.turns)
             )
         else:
-            between = _symmetric_beside(line, last.value, middle, periods)
+            between = _symmetric_beside(line, last.value, middle, last.motion)
         if between is None or not _is_motion(between):
             continue
         found = _points(line, condition, between)
@@ -332,17 +332,20 @@ def _is_on_the_way(one: MotionRow, last: MotionRow, new: MotionRow) -> bool:
 
 
 def _symmetric_beside(
-    line: ForcedLine, value: float, start: np.ndarray, periods: int
+    line: ForcedLine, value: float, start: np.ndarray, like: PeriodicMotion
 ) -> MotionRow | None:
-    """A symmetric motion with about that start, beside a value: where asymmetric ones leave it the
-    equations are singular."""
-    for shift in (LEAVES[0], -LEAVES[0]):
-        there = value + shift * line.length
+    """A symmetric motion with about that start, or near one that is like it, beside a value: where
+    asymmetric ones leave it the equations are singular."""
+    for size, side in itertools.product(LEAVES, (1.0, -1.0)):
+        there = value + side * size * line.length
         if line.first <= there <= line.last:
             osc = line.at(there)
-            row = MotionRow(there, periodic_from(osc, start, periods, line.turns))
-            if _is_motion(row) and is_symmetric(osc, row.motion):
-                return row
+            for begun in (np.asarray(like.at(osc).start), start):
+                if not np.all(np.isfinite(begun)):
+                    continue
+                row = MotionRow(there, periodic_from(osc, begun, like.periods, line.turns))
+                if _is_motion(row) and is_symmetric(osc, row.motion):
+                    return row
     return None
 
 
@@ -498,7 +501,8 @@ def _other_branches(line: ForcedLine, point: BifurcationPoint, begun: MotionRow)
     if not _breaks_symmetry(line, point):
         return []
     if not is_symmetric(line.at(begun.value), begun.motion):
-        symmetric = _symmetric_beside(line, value, np.asarray(cycle.start), cycle.periods)
+        start = np.asarray(cycle.start)
+        symmetric = _symmetric_beside(line, value, start, cycle)
         return [one for one in (symmetric, _image(line, begun)) if one is not None]
     touches = isinstance(point.condition, GrazingEdge)
     leaving = _asymmetric_beyond(line, point) if touches else _leaving(line, point)

@@ -537,8 +537,13 @@ def without_one_of(
     one touches only where the others do.
     """
     for row in short:
-        duration = rows.z[row, 3]
-        alike = [i for i in short if abs(rows.z[i, 3] - duration) < ALIKE_ARCS * duration]
+        duration, alike = rows.z[row, 3], [row]
+        for i in short:
+            # Of arcs that follow one another one lies between two others.
+            beside = any(abs(i - k) < 2 for k in alike)
+            if not beside and abs(rows.z[i, 3] - duration) < ALIKE_ARCS * duration:
+                alike.append(i)
+        alike.sort()
         for some in [alike, [row]] if len(alike) > 1 else [[row]]:
             shorter = rows
             for i in reversed(some):
