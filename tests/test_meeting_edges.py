@@ -237,3 +237,19 @@ def test_a_pseudo_focus_does_not_capture_loops_around_another_edge(gap, speed):
     assert (cycle.x1_min, cycle.x1_max) == pytest.approx(seen.x1, abs=1e-9)
     told = jb.sweep(lambda: osc, {"x2": np.array([speed, 0.1])}, y0=start, observe="attractor")
     assert jb.decoded(told).kind.values[0] == "cycle"
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_edges_of_a_split_belt_meet_another_one(way):
+    """Both halves change together where the edges have changed places; also in the mirror."""
+    law = jb.presets.paper_friction()
+
+    def make(edge):
+        ends = dict(upper=edge) if way > 0 else dict(lower=-edge)
+        other = dict(lower=0.0) if way > 0 else dict(upper=0.0)
+        halves = [jb.Belt(-0.5 * way, law, load=0.125, **ends)] * 2
+        return jb.Oscillator(0.25, [*halves, jb.Belt(0.25 * way, law, load=0.5, **other)])
+
+    for half in (0, 1):
+        point = jb.refine(jb.MeetingEdges((half, 2)), make, at=0.01)
+        assert point.status == jb.Status.OK and abs(float(point.value)) < 1e-12
