@@ -164,11 +164,12 @@ def bifurcation_diagram(
         resolution: As for `scan`, which finds the special points.
         start: For a forced oscillator only, whose diagram is the branch of one periodic motion,
             stable and unstable, with the points on it, and the branches that leave it at period
-            doublings (rows and resolution do not count): that motion, or a start (x1, x2) at t = 0
-            that leads to it with the parameter in the middle of the span. None: one that is found
-            in the middle of the span, and, where the branches so far do not reach, in the middle of
-            the widest part without one. A branch ends where no motion is found beyond a point, or
-            where it cannot be followed further or grows beyond all bounds, see `open_ends`.
+            doublings and where symmetry breaks (rows and resolution do not count): that motion, or
+            a start (x1, x2) at t = 0 that leads to it with the parameter in the middle of the span.
+            None: one that is found in the middle of the span, and, where the branches so far do not
+            reach, in the middle of the widest part without one. A branch ends where no motion is
+            found beyond a point, or where it cannot be followed further or grows beyond all bounds,
+            see `open_ends`.
 
     Returns:
         The `BifurcationDiagram`.

@@ -70,9 +70,9 @@ def refine(
     second search. `value` and `cycle` are differentiable with respect to the other parameters.
 
     For forced oscillators the conditions are those on a periodic motion: `PeriodDoubling()`,
-    `Fold()`, `Torus()`, `GrazingSliding(belt)`, `CrossingSliding(belt)`, `SwitchingSliding(belt)`,
-    `AddingSliding(belt)`, `GrazingEdge(belt)` and `CornerCollision(belt)`. The nearest point is
-    taken; not under `jax.vmap` and `jax.jit`.
+    `Fold()`, `SymmetryBreaking()`, `Torus()`, `GrazingSliding(belt)`, `CrossingSliding(belt)`,
+    `SwitchingSliding(belt)`, `AddingSliding(belt)`, `GrazingEdge(belt)` and
+    `CornerCollision(belt)`. The nearest point is taken; not under `jax.vmap` and `jax.jit`.
 
     Args:
         condition: `Hopf()`, `NonsmoothFold(belt)`, `GrazingSliding(belt)`,

@@ -50,8 +50,8 @@ class SpecialPoint(NamedTuple):
         kind: The kind.
         belts: Numbers of the belts concerned.
         values: Values of the two parameters.
-        residual: Largest error in all equations; where the end of a curve is extrapolated, error of
-            that.
+        residual: Largest error in all equations; where the end of a curve is extrapolated, or the
+            events of a motion change, error of that.
     """
 
     kind: str
