@@ -103,6 +103,17 @@ def test_branches_of_symmetric_and_asymmetric_motions_meet(point, at):
     assert abs(one.x1_max[-1] - image.x1_max[-1]) > 0.01
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("at", [0.46, 0.475])
+def test_two_events_that_vanish_at_once_are_a_point(at):
+    """Of a symmetric motion both crossings do; whatever the steps to the point are."""
+    diagram = jb.bifurcation_diagram(
+        osc, span=(0.445, 0.476), start=jb.find_cycle(osc(at), (0.5, 0.2))
+    )
+    assert [p.kind for p in diagram.points] == ["Fold", "SwitchingSliding", "Fold"]
+    assert float(diagram.points[1].value) == pytest.approx(0.4484671346378, abs=1e-11)
+
+
 def between_edges(frequency):
     """A mass that touches two belts at +-0.8, and is free between."""
     law = jb.Coulomb(1.0, 0.8)

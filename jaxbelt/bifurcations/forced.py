@@ -422,15 +422,34 @@ class _AtArrival(AbstractForcedCondition):
             if not (known or float(rises) * self.rises > 0 or abs(float(distance)) > 0.1):
                 continue
             yield Beginning(rows, abs(float(distance)), system(row, held))
-            returns = row + 2 < len(rows.ends) and rows.ends[row + 1] == k
-            if returns and after[k] == -before[k] and rows.codes[row + 2, k] == STUCK:
-                # It crosses, comes back, and sticks: maybe soon, and the excursion is to vanish.
-                gone, phase = rows.z[row + 1], rows.z[row + 2]
-                longer = np.append(gone[:3], phase[3] + gone[3])
-                there = rows.put(
-                    row + 1, row + 2, (rows.codes[row + 2], rows.ends[row + 2], longer)
-                )
-                yield Beginning(there, max(abs(float(distance)), gone[3]), system(row, held))
+            if row in (soon := _short_crossings(rows)):
+                # Maybe the excursion is to vanish; those of a symmetric motion do so at once.
+                gone = rows.z[row + 1, 3]
+                alike = [r for r in soon if abs(rows.z[r + 1, 3] - gone) <= ALIKE_ARCS * gone]
+                for some in [alike, [row]] if len(alike) > 1 else [[row]]:
+                    at = row - sum(r < row for r in some)
+                    there = _without_crossings(rows, some)
+                    yield Beginning(there, max(abs(float(distance)), gone), system(at, held))
+
+
+def _short_crossings(rows: ArcRows) -> list[int]:
+    """The arcs behind which the mass crosses the boundary of a belt, comes back, and sticks."""
+    found = []
+    for row, belt in enumerate(rows.ends[:-2].tolist()):
+        if belt < rows.codes.shape[1] and rows.ends[row + 1] == belt:
+            before, beyond, after = rows.codes[row : row + 3, belt]
+            if abs(before) == 1 and beyond == -before and after == STUCK:
+                found.append(row)
+    return found
+
+
+def _without_crossings(rows: ArcRows, some: list[int]) -> ArcRows:
+    """The arcs without the excursions behind some, which stick at once."""
+    for row in reversed(some):
+        gone, phase = rows.z[row + 1], rows.z[row + 2]
+        longer = np.append(gone[:3], phase[3] + gone[3])
+        rows = rows.put(row + 1, row + 2, (rows.codes[row + 2], rows.ends[row + 2], longer))
+    return rows
 
 
 @jit
