@@ -79,6 +79,7 @@ def test_every_public_function_and_class_that_takes_arguments_is_among_the_mista
         "AbstractFriction",
         "AtEvents",
         "PeriodDoubling",
+        "SymmetryBreaking",
         "Torus",
         "EquilibriumKind",
         "EventKind",

@@ -40,6 +40,7 @@ NO_RESULTS = {
     *(jb.MeetingEdges, jb.NonsmoothFold, jb.PseudoHopf, jb.SaddleConnection),
     *(jb.SlidingExchange, jb.SuddenSliding),
     *(jb.AddingSliding, jb.Fold, jb.PeriodDoubling, jb.SwitchingSliding, jb.Torus),
+    jb.SymmetryBreaking,
 }
 PUBLIC = [getattr(jb, name) for name in jb.__all__]
 RESULTS = [one for one in PUBLIC if inspect.isclass(one) and one not in NO_RESULTS]
