@@ -64,6 +64,8 @@ SOME_PHASES = (0.0, 0.25, 0.5, 0.75)
 NEAR_POINT = 0.1
 #: Of two motions that follow one another the way between them is straight up to this part.
 STRAIGHT_WAY = 0.1
+#: Halves of a motion that are alike up to this part of what they were before are one.
+GONE_OVER = 1e-4
 #: States of a motion half of its periods later that differ by less: a period doubling is near.
 ALIKE_HALVES = 0.03
 #: Multipliers of two motions, between which events change and nothing else happens, differ by less,
@@ -296,10 +298,11 @@ def _merging_between(line: ForcedLine, last: MotionRow, new: MotionRow) -> Bifur
         halves = _apart(line, condition, last)
         if halves is None:
             continue
-        ahead = _apart(line, condition, new) if is_known else None
-        if is_known and (ahead is None or np.sum(halves * ahead) >= 0):
+        ahead, size = _apart(line, condition, new) if is_known else None, np.max(np.abs(halves))
+        # Newton's method may also have gone over to the motion that the branch has left.
+        is_over = ahead is None or np.max(np.abs(ahead)) < GONE_OVER * size
+        if is_known and not is_over and np.sum(halves * ahead) >= 0:
             continue
-        size = np.max(np.abs(halves))
         if not is_known and size > ALIKE_HALVES:
             continue
         middle = np.asarray(last.motion.start) - 0.5 * halves[0]
