@@ -104,6 +104,24 @@ def test_branches_of_symmetric_and_asymmetric_motions_meet(point, at):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("unit", "omega"), [(1e-5, 300.0), (1e5, 1 / 300)])
+def test_both_images_are_followed_in_other_units(point, unit, omega):
+    """Where they meet Newton's method goes from one to the other, by rounding."""
+    speed = unit * omega
+    law = jb.Stribeck(1.0, 0.5, 0.3 * speed)
+
+    def make(frequency):
+        belts = [jb.Belt(way * VELOCITY * speed, law, LOAD * unit) for way in (1.0, -1.0)]
+        return jb.Oscillator(DAMPING, belts, omega, forcing=jb.Harmonic(unit, frequency))
+
+    start = jb.find_cycle(make(0.47), (0.5 * unit, 0.2 * unit))
+    diagram = jb.bifurcation_diagram(make, span=(0.465, 0.485), start=start)
+    (found,) = diagram.points
+    assert float(found.value) == pytest.approx(float(point.value), abs=1e-11)
+    assert len(diagram.branches) == 3 and diagram.open_ends == ()
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("at", [0.46, 0.475])
 def test_two_events_that_vanish_at_once_are_a_point(at):
     """Of a symmetric motion both crossings do; whatever the steps to the point are."""

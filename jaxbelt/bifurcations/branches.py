@@ -5,7 +5,8 @@ pseudo-arclength follows, round folds, too. Between two points of it functions o
 change their signs; then that point is solved for. Where the motion leaves its signature, the
 conditions on sliding are solved from the last motion before, and the nearest of their points is
 where the branch goes on with another signature: to the other side of the point, or back on the same
-one. At a period doubling the other branch that meets this one there is followed, too.
+one. At a period doubling, and where symmetry breaks, the other branches that meet this one there
+are followed, too.
 """
 
 import itertools
@@ -34,6 +35,7 @@ from .forced import (
     SwitchingSliding,
     Torus,
     friction_jumps,
+    motion_between_halves,
 )
 from .forced_ends import borders_of
 from .legs import ForcedLine, MotionBranch, MotionLeg, MotionRow
@@ -66,12 +68,13 @@ NEAR_POINT = 0.1
 STRAIGHT_WAY = 0.1
 #: Halves of a motion that are alike up to this part of what they were before are one.
 GONE_OVER = 1e-4
-#: States of a motion half of its periods later that differ by less: a period doubling is near.
+#: States of a motion that differ by less from those half of its periods later, or of its image: a
+#: point is near in which it has left another one.
 ALIKE_HALVES = 0.03
 #: Multipliers of two motions, between which events change and nothing else happens, differ by less,
 #: over 1 and their size.
 ALIKE_MULTIPLIERS = 0.1
-#: How far along the direction that a period doubling shows the motion that leaves is looked for.
+#: How far from a point motions that leave another one there, and that one, are looked for.
 LEAVES = (1e-3, 1e-2, 5e-2)
 
 
@@ -111,12 +114,25 @@ def forced_branches(
 
 def _is_on_branch(line: ForcedLine, row: MotionRow, branch: MotionBranch) -> bool:
     """Whether a motion is one of a branch."""
-    osc, other = line.at(row.value), branch.rows[len(branch.rows) // 2]
-    if line.is_symmetric and (
-        is_symmetric(osc, row.motion) != is_symmetric(line.at(other.value), other.motion)
-    ):  # Where they meet Newton's method goes from one to the other.
+    near = min(branch.rows, key=lambda one: abs(one.value - row.value))
+    # Where a symmetric motion, an asymmetric one and its image meet, Newton's method goes from one
+    # to another.
+    if line.is_symmetric and _side_of_symmetry(line, row) != _side_of_symmetry(line, near, row):
         return False
-    return _has_passed(branch.rows, row.value, osc, row.motion)
+    return _has_passed(branch.rows, row.value, line.at(row.value), row.motion)
+
+
+def _side_of_symmetry(line: ForcedLine, row: MotionRow, like: MotionRow | None = None) -> float:
+    """0 for a symmetric motion; 1, or -1 if it is asymmetric in the other sense than another one.
+
+    Motions of an even number of periods have no sense.
+    """
+    osc = line.at(row.value)
+    away = asymmetry_of(osc, row.motion)
+    if away is None or is_symmetric(osc, row.motion):
+        return float(away is None)
+    other = None if like is None else asymmetry_of(line.at(like.value), like.motion)
+    return 1.0 if other is None else float(np.sign(away @ other))
 
 
 def _widest_gap(line: ForcedLine, branches: list[MotionBranch]) -> tuple[float, float]:
@@ -306,16 +322,12 @@ def _merging_between(line: ForcedLine, last: MotionRow, new: MotionRow) -> Bifur
         if not is_known and size > ALIKE_HALVES:
             continue
         middle = np.asarray(last.motion.start) - 0.5 * halves[0]
-        periods = last.motion.periods // (2 if isinstance(condition, PeriodDoubling) else 1)
         if isinstance(condition, PeriodDoubling):
-            between = MotionRow(
-                last.value, periodic_from(line.at(last.value), middle, periods, line.turns)
-            )
+            motion = motion_between_halves(line.at(last.value), last.motion, line.turns)
+            between = None if motion is None else MotionRow(last.value, motion)
         else:
             between = _symmetric_beside(line, last.value, middle, last.motion)
-        if between is None or not _is_motion(between):
-            continue
-        found = _points(line, condition, between)
+        found = [] if between is None else _points(line, condition, between)
         near = [p for p in found if np.max(np.abs(np.asarray(p.cycle.start) - middle)) < size]
         if near:
             return near[0]
@@ -359,8 +371,7 @@ def _apart(line: ForcedLine, condition: AbstractCondition, row: MotionRow) -> np
     if isinstance(condition, PeriodDoubling):
         starts = np.asarray(row.motion.starts)
         return None if odd else starts - np.roll(starts, -half, axis=0)
-    osc = line.at(row.value)
-    if not (odd and line.is_symmetric) or is_symmetric(osc, row.motion):
+    if not line.is_symmetric or is_symmetric(osc := line.at(row.value), row.motion):
         return None
     away = asymmetry_of(osc, row.motion)
     return None if away is None else away[None]
@@ -388,7 +399,7 @@ def _past_corner(
     if not alike or away > apart or _has_passed(rows, value, osc, motion):
         return None
     row = MotionRow(value, motion)
-    return row if MotionLeg.begun(line, row)[1].found else None
+    return row if _begins(line, row) else None
 
 
 def _borders(line: ForcedLine, row: MotionRow) -> list[BifurcationPoint]:
@@ -432,7 +443,7 @@ def _through_point(
             end = row
         elif further is None and not _has_passed(rows, row.value, osc, row.motion):
             sense = float(np.sign(row.value - float(point.value)))
-            further = (row, sense) if MotionLeg.begun(line, row)[1].found else None
+            further = (row, sense) if _begins(line, row) else None
     if further is None:
         further = _beyond_point(line, rows, point, direction)
     return [*_points_between(line, last, end), point], further
@@ -469,7 +480,7 @@ def _beyond_point(
                 ended = of_one_loop(motion.signature) == of_one_loop(last.motion.signature)
                 if (side > 0 and ended) or _has_passed(rows, there, osc, motion):
                     continue
-                if MotionLeg.begun(line, row)[1].found:
+                if _begins(line, row):
                     return row, side * direction
     return None
 
@@ -504,8 +515,7 @@ def _other_branches(line: ForcedLine, point: BifurcationPoint, begun: MotionRow)
     if not _breaks_symmetry(line, point):
         return []
     if not is_symmetric(line.at(begun.value), begun.motion):
-        start = np.asarray(cycle.start)
-        symmetric = _symmetric_beside(line, value, start, cycle)
+        symmetric = _symmetric_beside(line, value, np.asarray(cycle.start), cycle)
         return [one for one in (symmetric, _image(line, begun)) if one is not None]
     touches = isinstance(point.condition, GrazingEdge)
     leaving = _asymmetric_beyond(line, point) if touches else _leaving(line, point)
@@ -561,8 +571,5 @@ def _leaving(line: ForcedLine, point: BifurcationPoint) -> Iterator[MotionRow]:
             motion = periodic_from(osc, guess, periods, line.turns, share)
             row = MotionRow(there, motion)
             fine = _is_motion(row) and motion.periods == periods
-            if not fine or (not doubles and is_symmetric(osc, motion)):
-                continue
-            # Too near to the point the equations are singular.
-            if MotionLeg.begun(line, row)[1].found:
+            if fine and (doubles or not is_symmetric(osc, motion)) and _begins(line, row):
                 yield row

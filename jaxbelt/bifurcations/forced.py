@@ -409,6 +409,8 @@ class _AtArrival(AbstractForcedCondition):
     def beginnings_of(self, osc, motion, known=False):
         rows, k, way = ArcRows.of(motion), int(self.belt), jnp.asarray(self.rises)
 
+        soon = _short_crossings(rows)
+
         def system(row, held):
             return lambda chain: AtLimit(chain, jnp.asarray(row), held, way)
 
@@ -422,7 +424,7 @@ class _AtArrival(AbstractForcedCondition):
             if not (known or float(rises) * self.rises > 0 or abs(float(distance)) > 0.1):
                 continue
             yield Beginning(rows, abs(float(distance)), system(row, held))
-            if row in (soon := _short_crossings(rows)):
+            if row in soon:
                 # Maybe the excursion is to vanish; those of a symmetric motion do so at once.
                 gone = rows.z[row + 1, 3]
                 alike = [r for r in soon if abs(rows.z[r + 1, 3] - gone) <= ALIKE_ARCS * gone]

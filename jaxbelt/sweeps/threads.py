@@ -196,9 +196,9 @@ class _Team:
         with _settings(device):
             call = Call(zero, zero, zero, zero, np.bool_(False))
             queue = jax.device_put(self._queue())
-            jax.block_until_ready(self.kernel(queue, call, self._streams(device)))
+            jax.block_until_ready(self.kernel(queue, call, self._begun(device)))
 
-    def _streams(self, device) -> Any:
+    def _begun(self, device) -> Any:
         if device not in self.streams:
             self.streams[device] = self.idle()
         return self.streams[device]
@@ -207,7 +207,7 @@ class _Team:
         """Takes chunks until there are no more, or until the team is stopped."""
         with _settings(device):
             passes = self.first_passes
-            streams, todo = self._streams(device), self.chunks.take()
+            streams, todo = self._begun(device), self.chunks.take()
             while todo is not None and not self.stop.is_set():
                 (first, last), todo = todo, self.chunks.take()
                 queue, drain = self._queue(), todo is None
