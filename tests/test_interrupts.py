@@ -169,7 +169,9 @@ def test_interrupts_of_a_session_lose_nothing(tmp_path, monkeypatch):
     assert told["interrupted"] == 3 and told["longest"] < SOON
 
 
-def test_an_interrupt_in_a_callback_of_the_garbage_collector_is_not_lost(monkeypatch):
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("where", [(threads, "wait"), (Question, "of"), (Memory, "dataset")])
+def test_an_interrupt_in_a_callback_of_the_garbage_collector_is_not_lost(monkeypatch, where):
     """Python would print that it is ignored, and the sweep would go on to its end."""
     sent = []
 
@@ -178,15 +180,16 @@ def test_an_interrupt_in_a_callback_of_the_garbage_collector_is_not_lost(monkeyp
             sent.append(phase)
             os.kill(os.getpid(), signal.SIGINT)
 
-    def collect(*_, **__):
-        # As the main thread does anywhere while it waits.
+    def collect(*arguments, **options):
+        # As the main thread does anywhere while it waits, and before and after.
         gc.callbacks.append(interrupt_once)
         gc.collect()
         gc.callbacks.remove(interrupt_once)
-        return waits(*_, **__)
+        return does(*arguments, **options)
 
-    waits = threads.wait
-    monkeypatch.setattr(threads, "wait", collect)
-    with pytest.raises(KeyboardInterrupt):
+    does = getattr(*where)
+    monkeypatch.setattr(*where, collect)
+    with pytest.raises(KeyboardInterrupt, match="interrupted"):
         jb.sweep(jb.presets.class_b, {"nu0": [0.3], "nu1": [0.2]}, t1=1.0, progress=False)
     assert sent
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

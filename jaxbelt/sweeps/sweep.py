@@ -35,7 +35,7 @@ from .observers import Final
 from .progress import SweepProgress
 from .question import Question
 from .store import Store, blocks_of
-from .threads import CHUNK, run
+from .threads import CHUNK, heard_interrupts, run
 from .work import do_runs
 
 if TYPE_CHECKING:
@@ -167,7 +167,8 @@ def _explained_ends() -> "Iterator[list[Memory | Store]]":
     """
     known: list[Memory | Store] = []
     try:
-        yield known
+        with heard_interrupts(at_once=True):
+            yield known
     except KeyboardInterrupt:
         message = (
             known[0].interrupted()

@@ -132,7 +132,7 @@ def run(
         FIRST_PASSES.here // (1 + derivatives),
     )
     devices = jax.local_devices()
-    with _noted_interrupts() as raise_interrupt:
+    with heard_interrupts(at_once=False) as raise_interrupt:
 
         def look():
             raise_interrupt()
@@ -147,7 +147,6 @@ def run(
         finally:
             team.stop.set()
             wait(at_work, timeout=10 * PATIENCE)
-        raise_interrupt()
 
 
 def _first_streams(program: Program, shared, width: int, columns: int, derivatives: int) -> Any:
@@ -286,28 +285,47 @@ def _end_of_process() -> None:
         thread.join()
 
 
-@contextmanager
-def _noted_interrupts() -> Iterator[Callable[[], None]]:
-    """While the block runs an interrupt is only noted, and raised by the function that is given.
+class _Handler:
+    """A handler of interrupts that notes them, and raises them if so wished."""
 
-    Python raises it wherever the main thread is, and loses it in callbacks of its garbage
-    collector, such as JAX has.
+    def __init__(self, came: threading.Event, at_once: bool):
+        self.came = came
+        self.at_once = at_once
+
+    def __call__(self, number, frame) -> None:
+        self.came.set()
+        if self.at_once:
+            signal.default_int_handler(number, frame)
+
+    def raise_noted(self) -> None:
+        if self.came.is_set():
+            raise KeyboardInterrupt
+
+
+@contextmanager
+def heard_interrupts(*, at_once: bool) -> Iterator[Callable[[], None]]:
+    """While the block runs no interrupt is lost; within another such block those of that one count.
+
+    Python raises an interrupt wherever the main thread is, and loses it in callbacks of its garbage
+    collector, such as JAX has. So it is noted, too, and raised by the function that is given, and
+    at the end of the block.
+
+    Args:
+        at_once: Whether interrupts are raised where they come, too.
     """
-    is_usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    before = signal.getsignal(signal.SIGINT)
+    is_ours = isinstance(before, _Handler)
+    is_usual = is_ours or before is signal.default_int_handler
     if not is_usual or threading.current_thread() is not threading.main_thread():
         yield lambda: None
         return
-    came = threading.Event()
-
-    def raise_interrupt():
-        if came.is_set():
-            raise KeyboardInterrupt
-
-    signal.signal(signal.SIGINT, lambda *_: came.set())
+    handler = _Handler(before.came if is_ours else threading.Event(), at_once)
+    signal.signal(signal.SIGINT, handler)
     try:
-        yield raise_interrupt
+        yield handler.raise_noted
     finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGINT, before)
+    handler.raise_noted()
 
 
 def _wait(futures: list[Future], watch: Callable[[], None]) -> None:
