@@ -190,6 +190,6 @@ def test_an_interrupt_in_a_callback_of_the_garbage_collector_is_not_lost(monkeyp
     does = getattr(*where)
     monkeypatch.setattr(*where, collect)
     with pytest.raises(KeyboardInterrupt, match="interrupted"):
-        jb.sweep(jb.presets.class_b, {"nu0": [0.3], "nu1": [0.2]}, t1=1.0, progress=False)
+        jb.sweep(jb.presets.class_b, {"nu0": [0.3], "nu1": [0.2]}, t1=1.0, observe="final")
     assert sent
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

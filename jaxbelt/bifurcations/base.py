@@ -56,8 +56,7 @@ ARGUMENTS = {
 
 
 class Line(NamedTuple):
-    """Style of the curves of a kind: name in legends, colour, line style (as Matplotlib takes
-    it)."""
+    """Style of the curves of a kind: name in legends, colour, line style as of Matplotlib."""
 
     name: str
     colour: str

@@ -14,10 +14,9 @@ and each acceleration is one quotient, with the division last. That is for XLA o
 computes everything that it deems cheap again in each place where it is used; a division it keeps.
 
 Derivatives are forward mode (see `derivatives.in_directions`): step sizes carry none, the landing's
-Taylor step gives event times and states their exact ones, and so does the last step, t1 - t. The
-error of a step says nothing of theirs where the motion is small: near rest, any step will do for
-the state. So where derivatives are wanted, a step also has to keep the tolerance for a motion of
-size one in the linearised field.
+Taylor step gives event times and states their exact ones, and so does the last step, t1 - t. Near
+rest any step will do for the state, but not for them. So where derivatives are wanted, a step also
+has to keep the tolerance for a motion of size one in the linearised field.
 """
 
 import functools
