@@ -18,6 +18,7 @@ import functools
 import math
 from collections.abc import Callable
 from fractions import Fraction
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -27,7 +28,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..checks import require
-from ..model.instants import carried, guards_at, guards_trend, trend_of
+from ..model.instants import TimedState, Trend, carried, guards_at, guards_trend, trend_of
 from ..model.modes import capacity, mode_acceleration, mode_of, select, stick_velocity
 from ..model.oscillator import Oscillator, at_time, frequencies
 from ..motion.arcs import Ends
@@ -48,6 +49,7 @@ from .shooting import (
     end_guard,
     flow,
     jacobian,
+    over_mesh,
     slip_slopes,
     with_columns,
 )
@@ -110,7 +112,7 @@ def least_steps(osc: Oscillator, loop: Loop) -> int:
 def _counted_ends(osc: Oscillator, codes: Array, entries: Array, durations: Array) -> Array:
     """The numbers of steps that arcs need, by the mean density of steps along them."""
 
-    def one(codes, y, duration):
+    def one(osc, codes, y, duration):
         def advance(y, _):
             return coarse_step(osc, codes, y, duration / LEAST_STEPS)
 
@@ -118,7 +120,8 @@ def _counted_ends(osc: Oscillator, codes: Array, entries: Array, durations: Arra
         mean = jnp.mean(jnp.clip(jnp.nan_to_num(rho, nan=1.0), 1.0, 100.0))
         return jnp.where(mode_of(codes).any_stuck, 0.0, duration * mean / TIMED_STRIDE)
 
-    return lax.map(lambda row: one(*row), (codes, entries, durations))
+    rows = codes, entries, durations
+    return arc_by_arc(one)((osc,), rows)
 
 
 def timed_mesh(osc: Oscillator, size: int, codes: Array, y: Array, duration: Array) -> Array:
@@ -130,7 +133,7 @@ def timed_mesh(osc: Oscillator, size: int, codes: Array, y: Array, duration: Arr
     count = jnp.clip(jnp.ceil(duration * share[-1] / n / TIMED_STRIDE), 1, size)
     places = jnp.minimum(jnp.arange(size + 1.0) / count, 1.0)
     grid = jnp.interp(places, share / share[-1], jnp.linspace(0, 1, n + 1))
-    return jnp.where(slips, jnp.diff(grid), jnp.zeros(size).at[0].set(1.0))
+    return jnp.where(slips, jnp.diff(grid), jnp.where(jnp.arange(size) == 0, 1.0, 0.0))
 
 
 def timed_chain(
@@ -172,8 +175,8 @@ def _timed_arc_equations(
         period = forcing_period(osc, turns)
         left = after[2] - period * (1.0 if share is None else 1.0 + share)
         guard = jnp.where(end == names.period, left, end_guard(osc, codes, end, after))
-        after = after.at[2].set(jnp.where(end == names.period, after[2] - period, after[2]))
-        return jnp.append(after, guard)
+        t = jnp.where(end == names.period, after[2] - period, after[2])
+        return jnp.stack([after[0], after[1], t, guard])
 
     return lax.cond(any_lane(end != names.unused), followed, lambda unknown: unknown, unknown)
 
@@ -351,19 +354,9 @@ def states_at_phase(osc: Oscillator, chain: TimedChain, z: Array, phase: Array) 
     return jnp.where(chain.used[:, None], found, jnp.nan)
 
 
-def states_along(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array) -> Array:
-    """The states of an arc at the ends of its steps, its entry first, [steps + 1, 3].
-
-    A stick arc is cut into steps of one length.
-    """
-    fractions = jnp.where(mode_of(codes).any_stuck, jnp.full_like(mesh, 1 / mesh.size), mesh)
-
-    def advance(state, fraction):
-        new = _after(osc, codes, state, duration * fraction)
-        return new, new
-
-    _, states = lax.scan(advance, y, fractions)
-    return jnp.concatenate([y[None], states])
+def _steps_along(codes: Array, mesh: Array) -> Array:
+    """Steps along an arc as fractions of its duration; a stick arc is cut into equal ones."""
+    return jnp.where(mode_of(codes).any_stuck, jnp.full_like(mesh, 1 / mesh.size), mesh)
 
 
 def _after(osc: Oscillator, codes: Array, y: Array, h: Array) -> Array:
@@ -386,37 +379,79 @@ def guards_along(osc: Oscillator, chain: TimedChain, z: Array) -> tuple[Array, A
             found = guards_trend(osc, mode, y)
             return found.value, found.slope
 
-        states = states_along(osc, codes, mesh, unknown[:3], unknown[3])
+        y, duration = unknown[:3], unknown[3]
+        steps = _steps_along(codes, mesh)
+
+        def advance(y, fraction):
+            return _after(osc, codes, y, duration * fraction)
+
+        _, states = over_mesh(advance, y, steps, seen=lambda y: y)
+        states = jnp.concatenate([y[None], states])
         return states, *jax.vmap(at)(states)
 
     return arc_by_arc(one)((osc,), (chain.codes, chain.mesh, z))
 
 
-def least_guard(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array) -> Array:
-    """The least value that a guard of its mode has along an arc, up to rounding."""
-    mode = mode_of(codes)
-    states = states_along(osc, codes, mesh, y, duration)
-    least, _ = _least_between(osc, codes, states, lambda y: guards_at(osc, mode, y))
-    return jnp.min(least)
+class Least(NamedTuple):
+    """Of functions along an arc the least values; of the steps in which they are the states before,
+    [functions, 3], the lengths, and where in them, as fractions."""
+
+    value: Array
+    before: Array
+    h: Array
+    at: Array
 
 
-def _least_between(
-    osc: Oscillator, codes: Array, states: Array, function: Callable
-) -> tuple[Array, Array]:
-    """The least values of functions of the state between the ends of an arc's steps, and where, as
-    fractions of the steps, [steps, functions] each.
+def _least_along(
+    osc: Oscillator,
+    codes: Array,
+    mesh: Array,
+    y: Array,
+    duration: Array,
+    function: Callable[[Oscillator, TimedState], Array],
+) -> Least:
+    """The least values of functions of a known oscillator and of the state along an arc.
+
+    The states before steps are differentiable.
+    """
+    mode, known = mode_of(codes), lax.stop_gradient(osc)
+
+    def trend(y):
+        now = lax.stop_gradient((y[0], y[1], y[2]))
+        found = trend_of(known, mode, functools.partial(function, known), now)
+        there = jnp.isfinite(found.value)
+        return there, Trend(*(jnp.where(there, one, 0.0) for one in found))
+
+    def advance(carry, fraction):
+        y, (there, before), least = carry
+        h = duration * fraction
+        new = _after(osc, codes, y, h)
+        after = trend(new)
+        value, at = _least_between(before, after[1], lax.stop_gradient(h))
+        value = jnp.where(there, value, jnp.inf)
+        better = value < least.value
+        least = Least(
+            jnp.where(better, value, least.value),
+            jnp.where(better[:, None], y[None], least.before),
+            jnp.where(better, h, least.h),
+            jnp.where(better, at, least.at),
+        )
+        return new, after, least
+
+    begun = trend(y)
+    count = begun[1].value.size
+    zeros = jnp.zeros(count)
+    none = Least(jnp.full(count, jnp.inf), jnp.stack([y] * count), zeros, zeros)
+    (_, _, least), _ = over_mesh(advance, (y, begun, none), _steps_along(codes, mesh))
+    return least
+
+
+def _least_between(before: Trend, after: Trend, h: Array) -> tuple[Array, Array]:
+    """The least values in a step between two trends of functions, and where, as its fractions.
 
     There a function is the quintic with its values, slopes and curvatures at both ends.
     """
-    mode = mode_of(codes)
-    at = jax.vmap(lambda y: trend_of(osc, mode, function, (y[0], y[1], y[2])))(states)
-    there = jnp.isfinite(at.value)
-    h = jnp.diff(states[:, 2])[:, None]
-    value, slope, curvature = (jnp.where(there, one, 0.0) for one in at)
-    start, end = (
-        (value[part], slope[part] * h, curvature[part] * h**2)
-        for part in (slice(None, -1), slice(1, None))
-    )
+    start, end = ((one.value, one.slope * h, one.curvature * h**2) for one in (before, after))
     between = quintic(start, end)
     slopes = derivative(between)
     bends = derivative(slopes)
@@ -426,8 +461,16 @@ def _least_between(
     for _ in range(4):
         first, second = polynomial(slopes, s), polynomial(bends, s)
         s = jnp.clip(s + step_to_root(first, second, where=second > 0), 0.0, 1.0)
-    least = jnp.minimum(jnp.min(values, axis=0), polynomial(between, s))
-    return jnp.where(there[:-1], least, jnp.inf), s
+    return jnp.minimum(jnp.min(values, axis=0), polynomial(between, s)), s
+
+
+def least_guard(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array) -> Array:
+    """The least value that a guard of its mode has along an arc, up to rounding."""
+
+    def guards(osc, y):
+        return guards_at(osc, mode_of(codes), y)
+
+    return jnp.min(_least_along(osc, codes, mesh, y, duration, guards).value)
 
 
 #: What is least where x1, and x2, is smallest or largest.
@@ -440,37 +483,29 @@ def extrema_along(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
     Differentiable by the oscillator and the unknowns, twice.
     """
 
+    def sides(osc, y):
+        return jnp.stack([y[0], -y[0], y[1], -y[1]])
+
     def one(osc, codes, mesh, unknown):
-        states = states_along(osc, codes, mesh, unknown[:3], unknown[3])
-        still = lax.stop_gradient((osc, states))
-        guess = _least_between(still[0], codes, still[1], lambda y: _SIDES @ jnp.stack(y[:2]))
-        return jax.vmap(functools.partial(_least, osc, codes, states))(
-            _SIDES, *(x.T for x in guess)
-        )
+        least = _least_along(osc, codes, mesh, unknown[:3], unknown[3], sides)
+        polished = functools.partial(_polished_least, osc, codes)
+        return jax.vmap(polished)(_SIDES, least.before, least.h, least.at)
 
     least = jnp.min(arc_by_arc(one)((osc,), (chain.codes, chain.mesh, z)), axis=0)
     return least * np.sum(_SIDES, axis=1)
 
 
-def _least(
-    osc: Oscillator,
-    codes: Array,
-    states: Array,
-    weight: Array | np.ndarray,
-    least: Array,
-    at: Array,
-):
-    """The least value of weight (x1, x2) along an arc, from the quintics' least values and their
-    places between the ends of steps, [steps] each."""
-    mode, step = mode_of(codes), jnp.argmin(least)
-    before, s = states[step], at[step]
-    h = states[step + 1, 2] - before[2]
+def _polished_least(
+    osc: Oscillator, codes: Array, weight: Array | np.ndarray, before: Array, h: Array, s: Array
+) -> Array:
+    """The least value of weight (x1, x2) near a fraction of a step of length h."""
+    mode = mode_of(codes)
 
     def state(s):
         return _after(osc, codes, before, s * h)
 
     def function(y):
-        return jnp.dot(weight, jnp.stack(y[:2]))
+        return weight[0] * y[0] + weight[1] * y[1]
 
     for _ in range(EXTREMUM_STEPS):
         s = lax.stop_gradient(s)

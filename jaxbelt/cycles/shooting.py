@@ -20,6 +20,7 @@ of a solution come from the implicit function theorem and work in forward and re
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -42,7 +43,7 @@ from ..model.oscillator import Oscillator, at_time, has_clock
 from ..model.transitions import onset_position
 from ..motion.arcs import Ends
 from ..motion.integrators import density
-from ..numerics.compiling import any_lane, lanes_in_one_kernel, one_kernel_alone
+from ..numerics.compiling import any_lane, lanes_in_one_kernel, one_kernel, one_kernel_alone
 from ..numerics.derivatives import moving_and_fixed
 from ..numerics.extrapolation import Scheme, increments, scheme
 from ..numerics.implicit import Equations, solution
@@ -65,9 +66,9 @@ _COARSE = scheme((2, 4))
 
 def arc_by_arc(function: Callable) -> Callable:
     """What function(*shared, *row) gives of each arc of a chain, its rows, as a function of the
-    shared and of the columns, a tuple each. All arcs are one piece of machine code; in a batch each
-    of them is one, of all lanes."""
-    of_lanes = lanes_in_one_kernel(function)
+    shared and of the columns, a tuple each. All arcs are one piece of machine code; in a batch, and
+    where they are too many, each of them is one, of all lanes."""
+    of_lanes = lanes_in_one_kernel(one_kernel(function))
 
     @functools.wraps(function)
     @one_kernel_alone
@@ -192,6 +193,36 @@ def coarse_step(osc: Oscillator, codes: Array, y: Array, h: Array) -> tuple[Arra
     return y, density(osc, mode_of(codes), *y)
 
 
+def over_mesh(
+    advance: Callable[[Any, Array], Any],
+    state: Any,
+    mesh: Array,
+    seen: Callable[[Any], Any] = lambda state: None,
+) -> tuple[Any, Any]:
+    """What advance(state, fraction) makes of a state, step by step of a mesh, [steps]; and what is
+    seen of the state after each step, [steps, ...].
+
+    Padding of a long mesh, steps of length zero at its end, is skipped.
+    """
+
+    def step(state, fraction):
+        new = advance(state, fraction)
+        return new, seen(new)
+
+    def some_steps(state, fractions):
+        def as_it_is():
+            rows = len(fractions)
+            return state, jax.tree.map(lambda x: jnp.stack([x] * rows), seen(state))
+
+        some = any_lane(jnp.any(fractions > 0))
+        return lax.cond(some, lambda: lax.scan(step, state, fractions), as_it_is)
+
+    if mesh.size > ARC_STEPS and mesh.size % ARC_STEPS == 0:
+        state, rows = lax.scan(some_steps, state, mesh.reshape(-1, ARC_STEPS))
+        return state, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)
+    return lax.scan(step, state, mesh)
+
+
 def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, extra=None):
     """End of one arc, (x1, x2), and the integrals of `extra(osc, mode, x1, x2)`, a vector, over it.
 
@@ -212,17 +243,9 @@ def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, 
     slip_time = jnp.where(stuck, 0.0, duration)
 
     def advance(state, fraction):
-        return arc_step(field, state, slip_time * fraction, FINE), None
+        return arc_step(field, state, slip_time * fraction, FINE)
 
-    def advance_some(state, fractions):
-        # Padding of a mesh is skipped.
-        some = any_lane(jnp.any(fractions > 0))
-        return lax.cond(some, lambda: lax.scan(advance, state, fractions)[0], lambda: state), None
-
-    if mesh.size > ARC_STEPS and mesh.size % ARC_STEPS == 0:
-        slipped, _ = lax.scan(advance_some, start, mesh.reshape(-1, ARC_STEPS))
-    else:
-        slipped, _ = lax.scan(advance, start, mesh)
+    slipped, _ = over_mesh(advance, start, mesh)
     if has_clock(osc):
         stuck_end = jnp.stack(carried(osc, mode, (y[0], y[1], y[2]), duration))
         return jnp.where(stuck, stuck_end, slipped)

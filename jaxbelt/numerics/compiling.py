@@ -461,7 +461,7 @@ POSSIBLE = frozenset(
     """abs acos acosh add add_any and argmax argmin asin asinh atan atan2 atanh broadcast_in_dim
     cbrt ceil clamp concatenate cond convert_element_type copy cos cosh cumsum custom_jvp_call
     empty2 div dynamic_slice dynamic_update_slice eq exp exp2 expm1 floor gather ge gt
-    integer_pow iota is_finite jit le le_to log log1p logistic lt max min mul ne neg nextafter
+    integer_pow iota is_finite jit le le_to log log1p logistic lt lt_to max min mul ne neg nextafter
     nonbatchable not or pow reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum
     rem remat2 reshape rev round rsqrt scan select_if_vmap select_n sign sin sinh slice sqrt
     square squeeze stack stop_gradient sub tan tanh transpose unvmap_any while xor""".split()
