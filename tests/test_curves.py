@@ -502,3 +502,66 @@ def test_a_curve_is_the_same_in_any_units():
     np.testing.assert_allclose(other.values / [1e3, 1e-3], one.values, rtol=1e-9)
     assert "cut off" not in repr(one)
     assert "cut off at max_points" in repr(curve(1.0, 1.0, most=5))
+
+
+@pytest.fixture(scope="module")
+def grazing():
+    return jb.refine(jb.GrazingSliding(0), lambda v: jb.presets.class_b(v, 0.35), at=-0.45)
+
+
+@pytest.mark.parametrize("step", [0.02, 0.03, 0.04, 0.06])
+def test_a_curve_goes_on_behind_a_second_contact_whatever_the_step_is(grazing, step):
+    """With every other step it ended there, as too few distances behind were tried."""
+    curve = jb.bifurcation_curve(grazing, jb.presets.class_b, ((-0.7, 0.7), (0.05, 0.6)), step=step)
+    assert curve.ends == (Stop.LEFT_SPAN, Stop.LEFT_SPAN)
+    ends = [[-0.3339897401171, 0.6], [-0.3339577470966, 0.05]]
+    np.testing.assert_allclose(curve.values[[0, -1]], ends, rtol=0, atol=1e-11)
+
+
+def with_an_edge(sigma, velocity):
+    return jb.presets.class_d(0.35, velocity, 0.0, sigma)
+
+
+@pytest.fixture(scope="module")
+def corner():
+    return jb.refine(jb.CornerCollision(0), lambda sigma: with_an_edge(sigma, 0.2), at=0.9)
+
+
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("step", [0.01, 0.02])
+@pytest.mark.parametrize("is_swapped", [False, True])
+def test_a_curve_goes_on_where_its_cycle_is_there_only_just_beside_it(corner, step, is_swapped):
+    """Behind belts of one velocity guesses from which to begin are few; both orders agree."""
+    span = (0.3, 1.5), (-0.3, 0.6)
+    if is_swapped:
+        curve = jb.bifurcation_curve(corner, lambda v, s: with_an_edge(s, v), span[::-1], step=step)
+    else:
+        curve = jb.bifurcation_curve(corner, with_an_edge, span, step=step)
+    values = curve.values[:, ::-1] if is_swapped else curve.values
+    assert Stop.LEFT_SPAN in curve.ends
+    last = values[np.argmax(values[:, 0])]
+    np.testing.assert_allclose(last, [1.5, 0.4210273673315], rtol=0, atol=1e-11)
+
+
+def test_places_are_those_of_the_cycles_beside(corner):
+    """Where x2 has got an extremum within an arc its smallest value was that of an event."""
+    curve = jb.bifurcation_curve(
+        corner, with_an_edge, ((0.55, 1.0), (0.04, 0.3)), step=0.03, max_points=25
+    )
+    known = 0
+    for (sigma, velocity), place in zip(curve.values, curve.places, strict=True):
+        for side in (1e-7, -1e-7):
+            cycle = jb.find_cycle(with_an_edge(sigma + side, velocity), (1.0, 0.0))
+            numbers = cycle.x1_min, cycle.x1_max, cycle.x2_min, cycle.x2_max, cycle.period
+            if int(cycle.status) == jb.Status.OK and abs(cycle.x1_max - place[1]) < 1e-3:
+                np.testing.assert_allclose(numbers, place, rtol=0, atol=2e-4)
+                known += 1
+    assert known > 20 and np.ptp(curve.places[:, 2]) > 0.05
+
+
+@pytest.mark.parametrize("count", [1, 2, 11, 12])
+def test_a_curve_has_as_many_points_as_asked_for(points, count):
+    curve = jb.bifurcation_curve(
+        points[0], (nu0, nu1), ((-0.7, 0.7), (0.05, 0.6)), max_points=count
+    )
+    assert len(curve) == 2 * count - 1

@@ -389,3 +389,29 @@ def two_waves():
 def test_what_makes_no_sense_with_forcing_is_refused(targets, osc, message):
     with pytest.raises(ValueError, match=message):
         jb.design(osc, targets, where=frequency_of)
+
+
+@pytest.mark.slow
+def test_an_estimate_at_its_bound_is_held_there():
+    """The damping would be 0.0996 without it; the others are as if it were known."""
+    law = jb.Coulomb(1.0, 0.8)
+
+    def make(damping, amplitude, phase):
+        belt = jb.Belt(0.3, law, load=0.7)
+        return jb.Oscillator(damping, (belt,), forcing=jb.Harmonic(amplitude, 1.3, phase))
+
+    def forces(osc):
+        return osc.forcing[0].amplitude, osc.forcing[0].phase
+
+    ts = np.linspace(0, 30, 301)
+    x1 = jb.simulate(make(0.1, 0.9, 0.0), (1.0, 0.0), 30.0, ts=ts).ys[:, 0]
+    x1 = np.asarray(x1) + 1e-3 * np.random.default_rng(5).standard_normal(301)
+    bounds = [(0.1, 1.0), None, None]
+    where = lambda o: (o.damping, *forces(o))  # noqa: E731
+    found = jb.fit(make(0.15, 0.8, 0.5), ts, x1, where=where, noise=1e-3, bounds=bounds)
+    known = jb.fit(make(0.1, 0.8, 0.5), ts, x1, where=forces, noise=1e-3)
+    assert found.status == known.status == jb.Status.OK
+    assert float(found.estimates[0]) == pytest.approx(0.1, abs=1e-6)
+    assert found.standard_errors[0] == 0
+    np.testing.assert_allclose(found.estimates[1:], known.estimates, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(found.standard_errors[1:], known.standard_errors, rtol=1e-3)

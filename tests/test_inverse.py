@@ -12,7 +12,7 @@ import jaxbelt as jb
 from jaxbelt import Status
 from jaxbelt.inverse.fit import _inverted, _undetermined
 from jaxbelt.inverse.record import local_cubics
-from jaxbelt.inverse.selection import Selection, parameter_sizes
+from jaxbelt.inverse.selection import Selection, parameter_sizes, selection_of
 
 TS = np.arange(400) * 0.1
 START = (0.0, -2.0)
@@ -251,7 +251,7 @@ def test_a_motion_that_touches_no_boundary_tells_only_a_combination():
     assert result.status == Status.NOT_IDENTIFIED
     (group,) = result.undetermined
     assert set(group) >= {"belts[0].velocity", "belts[0].friction.steepness"}
-    assert "only a combination is told" in repr(result)
+    assert "only a combination is determined" in repr(result)
     two = jb.fit(osc, ts, x1, where=lambda o: some(o)[::3], noise=2e-3)
     assert two.status == Status.OK and two.undetermined == ()
 
@@ -409,3 +409,51 @@ def test_a_record_of_a_mass_that_sticks_throughout_tells_the_velocity_of_the_bel
     assert found.status == Status.OK
     # The record is exact.
     np.testing.assert_allclose(found.estimates, [0.35], rtol=1e-9)
+
+
+@pytest.mark.parametrize("upper", [np.inf, 1e9])
+def test_a_target_is_missed_by_its_nearer_end(upper):
+    """By a part of the farther one it was met at once."""
+    osc = jb.presets.class_b(0.45, 0.35)
+    found = jb.design(osc, [(jb.amplitude, (0.5, upper))], where=lambda o: o.belts[1].velocity)
+    assert found.status == Status.OK and found.achieved[0] >= 0.5 * (1 - 1e-9)
+    assert found.iterations > 0
+
+
+def test_bounds_are_where_an_oscillator_becomes_impossible():
+    law = jb.Stribeck(1.0, 0.5, 0.3)
+    load = jb.Oscillating(0.3, -0.1, 2.0)
+    belts = jb.Belt(0.1, law, load=load), jb.Belt(0.2, law, 0.2, lower=-0.8, upper=-0.2)
+    osc = jb.Oscillator(0.5, belts, forcing=jb.Harmonic(0.1, 1.0))
+
+    def interval(where, *others):
+        selection, _ = selection_of(osc, lambda o: (where(o), *(one(o) for one in others)), None)
+        return float(selection.lower[0]), float(selection.upper[0])
+
+    def static(o):
+        return o.belts[0].friction.static
+
+    def kinetic(o):
+        return o.belts[0].friction.kinetic
+
+    assert interval(lambda o: o.damping) == (-np.inf, np.inf)
+    assert interval(lambda o: o.belts[1].load) == (0.0, np.inf)
+    assert interval(lambda o: o.belts[1].upper) == (-0.8, np.inf)
+    assert interval(lambda o: o.belts[1].lower) == (-np.inf, -0.2)
+    assert interval(lambda o: o.belts[0].load.amplitude) == (-0.3, 0.3)
+    assert interval(static) == (0.5, np.inf) and interval(kinetic) == (0.0, 1.0)
+    # What is fitted together may change together.
+    assert interval(static, kinetic) == (0.0, np.inf)
+
+
+def test_a_contact_edge_below_zero_is_designed():
+    law = jb.Conti(1.0, 0.6, 10.0)
+
+    def make(upper):
+        belts = jb.Belt(0.1, law), jb.Belt(0.2, law, load=0.2, lower=-0.8, upper=upper)
+        return jb.Oscillator(0.5, belts)
+
+    wanted = jb.amplitude(jb.find_cycle(make(-0.23), (3.0, 0.0)))
+    found = jb.design(make(-0.2), [(jb.amplitude, wanted)], where=lambda o: o.belts[1].upper)
+    assert found.status == Status.OK
+    assert float(jb.amplitude(found.cycle)) == pytest.approx(float(wanted), rel=1e-9)

@@ -859,3 +859,12 @@ def test_what_is_in_si_units_is_not_scaled_again():
     assert once.start == "dimensionless: x2 = 0.0"
     with pytest.raises(ValueError, match="result must be dimensionless, got a dataset that is in"):
         jb.in_si(once, machine)
+
+
+def test_a_time_among_many_is_the_same_number():
+    """Else the last of some times is behind the end of the run."""
+    m = jb.Machine(0.5, 2000.0, 1.0, (jb.PhysicalBelt(0.02, jb.Coulomb(0.4, 0.3), 5.0),))
+    for end in np.arange(1, 50) / 10:
+        times = np.linspace(0, end, 41)
+        assert m.tau(times)[-1] == m.tau(end)
+        assert m.start(times, times)[0][-1] == m.start(end, end)[0]

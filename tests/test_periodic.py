@@ -920,3 +920,43 @@ def test_a_branch_does_not_come_home_the_way_that_it_has_gone():
         # Its end has a point, or is open.
         ends = np.append(values, found.open_ends)
         assert np.min(np.abs(ends - 0.325141094)) < 1e-8
+
+
+@pytest.mark.parametrize("frequency", [1.0, 0.25, 0.1])
+def test_exponents_of_a_linear_motion_are_known_where_one_is_lost_in_rounding(frequency):
+    """In a period of 63 units of time the second tangent shrinks to 1e-71 of its size."""
+    belt = jb.Belt(0.3, jb.Coulomb(1.0, 0.8), load=0.7)
+    osc = jb.Oscillator(3.0, (belt,), forcing=jb.Harmonic(0.9, frequency))
+    found = jb.lyapunov(osc, (1.0, 0.0), periods=50, transient=10)
+    assert not bool(found.sticks)
+    expected = [-1.5 + 1.25**0.5, -1.5 - 1.25**0.5]
+    np.testing.assert_allclose(found.exponents, expected, rtol=0, atol=1e-12)
+
+
+def test_areas_change_by_what_multipliers_multiply_to():
+    """Across two belts, with a law that bends."""
+    belts = (
+        jb.Belt(0.3, jb.Coulomb(1.0, 0.6), load=0.2),
+        jb.Belt(-0.2, jb.Stribeck(1.0, 0.5, 0.3), 0.2),
+    )
+    osc = jb.Oscillator(0.1, belts, forcing=jb.Harmonic(1.2, 0.7))
+    motion = jb.find_cycle(osc, (1.0, 0.0))
+    assert len(motion.signature) == 4 and not np.any(motion.stick_durations)
+    found = jb.lyapunov(osc, motion.start, periods=25, transient=0)
+    area = np.log(np.abs(np.prod(np.asarray(motion.multipliers))))
+    assert float(np.sum(found.per_period)) == pytest.approx(area, abs=1e-9)
+
+
+def test_forces_in_either_order_have_the_same_motions():
+    """One a hundred times as fast as the other: the slower one was not allowed to be the second."""
+    slow, fast = jb.Harmonic(0.5, 0.01), jb.Harmonic(0.9, 1.0)
+    belt = jb.Belt(0.3, jb.Coulomb(1.0, 0.8), load=0.1)
+    found = [
+        jb.find_cycle(jb.Oscillator(0.5, (belt,), forcing=forces), (1.0, 0.0))
+        for forces in ((slow, fast), (fast, slow))
+    ]
+    assert all(int(one.status) == OK and one.periods == 1 for one in found)
+    np.testing.assert_allclose(found[0].start, found[1].start, rtol=0, atol=1e-11)
+    unlike = jb.Oscillator(0.5, (belt,), forcing=(fast, jb.Harmonic(0.5, 1.01)))
+    with pytest.raises(ValueError, match="of 64 periods of the slowest at most"):
+        jb.find_cycle(unlike, (1.0, 0.0))

@@ -477,3 +477,33 @@ def test_the_winding_number_of_a_periodic_motion_counts_its_maxima():
     phases = np.arctan2(0.2 * 2.0, 1 - 2.0**2) + np.array([-1e-15, 0.0, 1e-15])
     row = jb.sweep(response, {"phase": phases}, y0=(0.0, 0.0), observe="attractor")
     np.testing.assert_array_equal(row.winding, 1.0)
+
+
+@pytest.mark.parametrize("frequency", [0.25, 1.0])
+@pytest.mark.parametrize("start", [2.0, 1.0])
+def test_a_motion_that_has_lost_its_tangent_once_attracts_nothing(frequency, start):
+    """Without damping and force a mass that stuck on its way comes to one of many circles."""
+
+    def make(frequency):
+        belt = jb.Belt(0.3, jb.Coulomb(1.0, 1.0), load=0.5)
+        return jb.Oscillator(0.0, (belt,), forcing=jb.Harmonic(0.0, frequency))
+
+    axes = {"frequency": [frequency]}
+    found = jb.decoded(jb.sweep(make, axes, y0=(start, 0.0), t1=3000.0, observe="attractor"))
+    assert found.kind[0] == "undecided" and found.status[0] == "neutral"
+
+
+@pytest.mark.parametrize("steepness", [2.0, 10.0, 100.0])
+def test_a_cycle_that_slips_past_the_strobe_repeats_nothing(steepness):
+    """A force of amplitude 0 whose period is nearly that of a cycle: the phase drifts, or stays
+    where it began."""
+    law = jb.Conti(1.0, 0.6, steepness)
+
+    def make(frequency):
+        return jb.Oscillator(0.5, (jb.Belt(0.1, law),), forcing=jb.Harmonic(0.0, frequency))
+
+    cycle = jb.find_cycle(jb.Oscillator(0.5, (jb.Belt(0.1, law),)), (3.0, 0.0))
+    frequencies = 2 * np.pi / float(cycle.period) * np.array([1.0, 1 + 1e-9, 1 + 1e-7])
+    axes = {"frequency": frequencies}
+    found = jb.decoded(jb.sweep(make, axes, y0=(0.9, 0.1), t1=5000.0, observe="attractor"))
+    assert list(found.kind.values) == ["undecided"] * 3

@@ -1,16 +1,20 @@
 """How a curve of bifurcation points goes on where the signature changes: `beyond_change`."""
 
+import itertools
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 
+from ..model.oscillator import has_clock
 from ..model.variations import Variation
 from .base import AbstractCondition, BifurcationPoint
+from .refine import points_within
 from .special import FAR, SpecialPoint, is_elsewhere
 from .tracks import Track
 
-#: How far from a change of signature the curve is searched for, in steps: the first distance, and
-#: at an edge the others, too, where it may bend sharply.
+#: How far from a change of signature the curve is searched for, in steps: it may bend sharply, or
+#: end near there.
 BESIDE_CHANGE = (0.5, 0.1, 0.02)
 #: What is no farther from the chords between rows is on the curve, in steps: neighbouring tangents
 #: differ by 18 degrees at most.
@@ -49,18 +53,15 @@ def beyond_change(
     rows: list[CurveRow],
     last: np.ndarray,
     centre: np.ndarray,
-    changes: list[SpecialPoint],
 ) -> tuple[BifurcationPoint, np.ndarray] | None:
     """The point of the same condition just beyond a change of signature, and where, or None.
 
     It has to be the same cycle, at about the same place. The curve may have a corner there, so the
-    search goes all around the change, except where the curve came from; changes: the point of
-    codimension two, where known.
+    search goes all around the change, except where the curve came from.
     """
-    touches = any(one.kind == "EdgeTouch" for one in changes)
     found = (
         _near_change(problem, track, rows, last, centre, part * problem.step)
-        for part in (BESIDE_CHANGE if touches else BESIDE_CHANGE[:1])
+        for part in BESIDE_CHANGE
     )
     return next((one for one in found if one is not None), None)
 
@@ -77,25 +78,34 @@ def _near_change(
     condition, before, place = problem.condition, last[-2:], track.place(last)
     known = problem.variation.oscillator(before), track.system, track.unknowns(last)
     came_from = (before - centre) / max(float(np.linalg.norm(before - centre)), 1e-12)
+
+    def direct(held: Variation, near: float) -> Iterator[BifurcationPoint | None]:
+        for offset in (-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0):
+            yield condition.named_point_beside(held, near + offset * reach, *known)
+
+    def searched(held: Variation, near: float) -> Iterator[BifurcationPoint | None]:
+        # Where the motion is there only just beside the curve, guesses miss it.
+        if not has_clock(known[0]):
+            yield from points_within(condition, held, near, 2 * reach)
+
     found: list[tuple[float, BifurcationPoint, np.ndarray]] = []
-    for free in (0, 1):
-        for side in (1.0, -1.0):
-            values = centre + side * reach * np.eye(2)[1 - free]
-            held = problem.variation.held(1 - free, float(values[1 - free]))
-            for offset in (-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0):
-                guess = float(values[free]) + offset * reach
-                point = condition.named_point_beside(held, guess, *known)
-                if point is None or is_elsewhere(point.place, place, FAR):
-                    continue
-                if point.condition.lineage != condition.lineage:
-                    continue
-                at = values.copy()
-                at[free] = float(point.value)
-                inside = np.all((problem.limits[:, 0] <= at) & (at <= problem.limits[:, 1]))
-                away = at - centre
-                distance = float(np.linalg.norm(away))
-                if inside and 0 < distance < 6 * reach and (away / distance) @ came_from < 0.7:
-                    found.append((distance, point, at))
+    for way, free, side in itertools.product((direct, searched), (0, 1), (1.0, -1.0)):
+        if found and way is searched:
+            break
+        values = centre + side * reach * np.eye(2)[1 - free]
+        held = problem.variation.held(1 - free, float(values[1 - free]))
+        for point in way(held, float(values[free])):
+            if point is None or is_elsewhere(point.place, place, FAR):
+                continue
+            if point.condition.lineage != condition.lineage:
+                continue
+            at = values.copy()
+            at[free] = float(point.value)
+            inside = np.all((problem.limits[:, 0] <= at) & (at <= problem.limits[:, 1]))
+            away = at - centre
+            distance = float(np.linalg.norm(away))
+            if inside and 0 < distance < 6 * reach and (away / distance) @ came_from < 0.7:
+                found.append((distance, point, at))
     curve = np.array([row.values for row in rows]), np.array([row.place for row in rows])
     for _, point, at in sorted(found, key=lambda one: one[0]):
         system, _ = point.condition.applied_to(point.oscillator).system_at(point)

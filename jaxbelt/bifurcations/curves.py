@@ -59,6 +59,8 @@ SHORTEST_PART = 1e-3
 JUST_AHEAD = 0.02
 #: How often the step in which the motion ceases to exist is halved to find where.
 HALVINGS_TO_END = 10
+#: How well a point is found again, with other arcs.
+SAME_POINT_AGAIN = 1e-8
 #: Number of points after which the integration steps are distributed anew.
 REMESH = 10
 
@@ -337,7 +339,8 @@ def _side(
     special: list[SpecialPoint] = []
     while True:
         note_progress(f"{len(rows)} points on one side")
-        leg = _leg(problem, track, u, direction, home)
+        most = min(REMESH, problem.max_points - max(len(rows) - 1, 0))
+        leg = _leg(problem, track, u, direction, home, most)
         points, beyond, end = leg.points, leg.beyond, leg.end
         rows += [_row_at(problem, track, at.u, seen) for at, seen in points[min(len(rows), 1) :]]
         special += [*leg.special, *leg.at_change]
@@ -369,8 +372,10 @@ def _side(
         elif beyond is None and end is not Stop.POINT_COUNT:
             return _ended(problem, rows, special, trail)
         elif beyond is None:
-            # The same curve with a new mesh.
-            track, u, direction = track.remeshed(last, points[-1][0].tangent)
+            # The same curve with a new mesh, or with arcs that end where x2 is extreme.
+            at, seen = points[-1]
+            begun = None if seen.is_cut else _begun_again(problem, track, at)
+            track, u, direction = begun or track.remeshed(last, at.tangent)
             continue
         # The signature changes here, or between the last two points.
         centre, error = last[-2:], SHORTEST_PART * problem.step
@@ -378,7 +383,7 @@ def _side(
             centre, error = _where_it_ends(track, points[-1][0], beyond)
         centre = np.array(changes[-1].values) if changes else centre
         is_end = bool(changes) and problem.condition.ends_at_contact
-        further = None if is_end else beyond_change(problem, track, rows, last, centre, changes)
+        further = None if is_end else beyond_change(problem, track, rows, last, centre)
         if further is None:
             return _ended(problem, rows, special, trail)
         special += [] if changes else border_at(problem.condition, trail, centre, error)
@@ -387,6 +392,25 @@ def _side(
         direction = direction * np.sign(direction[-2:] @ (u[-2:] - centre))
         rows.append(_row_at(problem, track, u, track.seen_at(u)))
         seen_last = []
+
+
+def _begun_again(
+    problem: CurveProblem, track: Track, at: CurvePoint
+) -> tuple[Track, np.ndarray, np.ndarray] | None:
+    """What follows the same curve from a point with the arcs that the motion has there, u, and the
+    direction; None where the same point is not found."""
+    osc, values, way = problem.variation.oscillator(at.u[-2:]), at.u[-2:], at.tangent[-2:]
+    held = int(np.argmax(np.abs(way)))
+    along = problem.variation.held(held, float(values[held]))
+    known = osc, track.system, track.unknowns(at.u)
+    point = problem.condition.named_point_beside(along, float(values[1 - held]), *known)
+    if point is None or point.condition.lineage != problem.condition.lineage:
+        return None
+    if abs(float(point.value) - values[1 - held]) > SAME_POINT_AGAIN:
+        return None
+    new, u = Track.begun(problem.variation, point, values)
+    direction = new.tangent(u)
+    return new, u, direction * np.sign(direction[-2:] @ way)
 
 
 def _where_it_ends(track: Track, last: CurvePoint, beyond: CurvePoint) -> tuple[np.ndarray, float]:
@@ -461,9 +485,10 @@ class _Leg(NamedTuple):
     end: Stop
 
 
-def _leg(problem: CurveProblem, track: Track, u, direction, home: _Home) -> _Leg:
+def _leg(problem: CurveProblem, track: Track, u, direction, home: _Home, most: int) -> _Leg:
+    """A leg of so many points at most, up to one at which x2 is extreme within an arc."""
     points, special = [], []
-    for at in _points_along(problem, track, u, direction):
+    for at in _points_along(problem, track, u, direction, most):
         if points:
             at = _closing(track, points[-1][0], at, home) or at
         new = at, track.seen_at(at.u)
@@ -474,6 +499,8 @@ def _leg(problem: CurveProblem, track: Track, u, direction, home: _Home) -> _Leg
         special += found
         if at.end is not None:
             return _Leg(points, special, [], None, at.end)
+        if len(points) > 1 and not new[1].is_cut:
+            return _Leg(points, special, [], None, Stop.POINT_COUNT)
     return _Leg(points, special, [], None, Stop.STEP_TOO_SMALL)
 
 
@@ -494,7 +521,9 @@ def _closing(track: Track, before: CurvePoint, after: CurvePoint, home: _Home) -
     return after._replace(u=at.u, tangent=at.tangent, end=Stop.CLOSED)
 
 
-def _points_along(problem: CurveProblem, track: Track, u: np.ndarray, direction: np.ndarray):
+def _points_along(
+    problem: CurveProblem, track: Track, u: np.ndarray, direction: np.ndarray, most: int
+):
     span = np.full((2, u.size), np.inf) * np.array([[-1.0], [1.0]])
     span[:, -2:] = problem.limits.T
     return continue_curve(
@@ -505,7 +534,7 @@ def _points_along(problem: CurveProblem, track: Track, u: np.ndarray, direction:
         step=problem.step,
         min_step=SHORTEST_PART * problem.step,
         max_step=problem.step,
-        max_points=REMESH,
+        max_points=most,
     )
 
 

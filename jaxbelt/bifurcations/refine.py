@@ -166,6 +166,16 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
     return point
 
 
+def points_within(
+    condition: AbstractCondition, variation: Variation, guess: float, reach: float
+) -> list[BifurcationPoint]:
+    """The points of that kind that the search of `scan` finds up to `reach` on both sides of a
+    guess; without forcing."""
+    path = _path_near(condition, variation, guess, reach)
+    found = [] if path is None else search(path, INTERVALS, near=1.0)
+    return [one for one in found if int(one.status) == Status.OK and condition.covers(one)]
+
+
 def _path_near(
     condition: AbstractCondition, variation: Variation, guess: float, reach: float
 ) -> ParameterPath | None:

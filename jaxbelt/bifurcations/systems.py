@@ -22,6 +22,7 @@ from jaxtyping import Array
 
 from ..cycles.attractors import extent
 from ..cycles.chains import Chain, after_each, first_failure, following_codes
+from ..cycles.closure import passes_extremum
 from ..cycles.cycle import Cycle, cycle_of
 from ..cycles.shooting import jacobian, meshed, residual, residual_and_blocks
 from ..model.families import Family
@@ -56,13 +57,15 @@ class Seen(NamedTuple):
     """What is seen at a point of a curve.
 
     tests: functions to watch; exists: whether there is such a motion; multiplier: of the cycle, or
-    NaN; residual: the largest error in all equations.
+    NaN; residual: the largest error in all equations; is_cut: whether arcs end wherever x2 is
+    extreme.
     """
 
     tests: Tests
     exists: Any
     multiplier: Any
     residual: Any
+    is_cut: Any = True
 
 
 class AbstractSystem(eqx.Module):
@@ -265,7 +268,8 @@ class CycleSystem(AbstractChainSystem):
         cycle, slope = cycle_of(osc, self.ordinary, x, jnp.asarray(0), ok, error)
         tests, is_meant, multiplier = self.watch(osc, x, slope)
         exists = (cycle.status == Status.OK) & (error < HOLDS) & is_meant
-        return Seen({**velocity_tests(osc), **tests}, exists, multiplier, error)
+        is_cut = ~passes_extremum(osc, self.chain, x)
+        return Seen({**velocity_tests(osc), **tests}, exists, multiplier, error, is_cut)
 
     def place(self, osc, x):
         return extent(x[np.asarray(self.chain.used)])

@@ -93,7 +93,8 @@ class Track(NamedTuple):
         osc, x = self.variation.oscillator(u[-2:]), jnp.asarray(self.unknowns(u))
         seen = _seen_at(osc, self.system, x)
         tests = {name: float(value) for name, value in seen.tests.items()}
-        return Seen(tests, bool(seen.exists), float(seen.multiplier), float(seen.residual))
+        numbers = float(seen.multiplier), float(seen.residual)
+        return Seen(tests, bool(seen.exists), *numbers, bool(seen.is_cut))
 
     def remeshed(self, u: np.ndarray, tangent: np.ndarray) -> tuple["Track", Any, Any]:
         """The same track with new integration steps, and u and the tangent in it."""

@@ -17,7 +17,6 @@ stick phase it has rank one, for what a motion remembers of its start is one num
 import functools
 import math
 from collections.abc import Callable
-from fractions import Fraction
 from typing import NamedTuple
 
 import equinox as eqx
@@ -28,7 +27,15 @@ from jax import lax
 from jaxtyping import Array
 
 from ..checks import require
-from ..model.instants import TimedState, Trend, carried, guards_at, guards_trend, trend_of
+from ..model.instants import (
+    TimedState,
+    Trend,
+    carried,
+    field_at,
+    guards_at,
+    guards_trend,
+    trend_of,
+)
 from ..model.modes import capacity, mode_acceleration, mode_of, select, stick_velocity
 from ..model.oscillator import Oscillator, at_time, frequencies
 from ..motion.arcs import Ends
@@ -59,7 +66,7 @@ from .shooting import (
 TIMED_STRIDE = 0.25
 #: The smallest mesh of an arc; steps by which steps are placed, for each that an arc may have.
 LEAST_STEPS, PLACING = 8 * ARC_STEPS, 2
-#: Periods of forces have a common multiple if their ratios have denominators up to this.
+#: A common period has so many periods of the slowest wave at most.
 RATIOS = 64
 #: Rounding of a ratio of two frequencies.
 RATIO_ROUNDING = 1e-14
@@ -82,16 +89,18 @@ class TimedChain(Chain):
 def turns_of(osc: Oscillator) -> int:
     """How many periods of the first wave, in the order of `frequencies`, are one of all waves.
 
-    `ValueError` where they have none in common.
+    `ValueError` where they have none in common, see `RATIOS`.
     """
     found = np.array([float(one) for one in lax.stop_gradient(frequencies(osc))])
-    ratios = [Fraction(one / found[0]).limit_denominator(RATIOS) for one in found.tolist()]
-    pairs = zip(ratios, found / found[0], strict=True)
-    common = all(
-        abs(float(ratio) - one) <= RATIO_ROUNDING * one and ratio > 0 for ratio, one in pairs
+    ratios = np.abs(found / np.min(np.abs(found)))
+    passed = np.arange(1, RATIOS + 1)[:, None] * ratios
+    whole = np.abs(passed - np.round(passed)) <= RATIO_ROUNDING * passed
+    common = np.flatnonzero(np.all(whole, axis=1))
+    expected = f"a period in common, of {RATIOS} periods of the slowest at most"
+    require(
+        common.size > 0, "osc", f"such that all its frequencies have {expected}", found.tolist()
     )
-    require(common, "osc", "such that all its frequencies have a period in common", found.tolist())
-    return math.lcm(*(ratio.denominator for ratio in ratios))
+    return round(passed[common[0], 0])
 
 
 def forcing_period(osc: Oscillator, turns: int) -> Array:
@@ -267,6 +276,50 @@ def _maps_and_slopes(turns, osc, along, share, codes, end, mesh, unknown: Array)
 def arc_maps(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
     """`_arc_map` of all arcs, [N, 3, 3]."""
     return _arc_maps(chain.turns)((osc, chain.share), arc_columns(chain, z))
+
+
+def logs_of_areas(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
+    """The logarithms of the factors by which arcs change areas of states, with the saltation at
+    their ends, [N]; not of stick arcs, behind which nothing is left of an area.
+
+    By the divergence of the field (Liouville's formula), so they are exact where the products of
+    `arc_maps` have lost the smaller one of two directions in rounding. At a boundary an area
+    changes by the ratio of the rates at which that is passed behind and before.
+    """
+
+    def one(osc, codes, end, mesh, after, unknown):
+        mode, n = mode_of(codes), len(osc.belts)
+
+        def field(y):
+            now = at_time(osc, y[2])
+
+            def acceleration(x2):
+                return mode_acceleration(now, mode, y[0], x2)
+
+            _, divergence = jax.jvp(acceleration, (y[1],), (jnp.ones_like(y[1]),))
+            return jnp.append(slip_slopes(osc, codes, y[:3]), divergence)
+
+        def advance(y, fraction):
+            return arc_step(field, y, unknown[3] * fraction, FINE)
+
+        begun = jnp.append(unknown[:3], 0.0)
+        last, _ = over_mesh(advance, begun, jnp.where(mode.any_stuck, 0.0, mesh))
+        state = last[0], last[1], last[2]
+
+        def distances(*y):
+            now = at_time(osc, y[2])
+            return jnp.stack([belt.velocity - osc.omega * y[1] for belt in now.belts])
+
+        before, behind = (
+            jax.jvp(distances, state, field_at(osc, one, state))[1]
+            for one in (mode, mode_of(after))
+        )
+        at = jnp.arange(n) == end
+        ratio = jnp.sum(jnp.where(at, behind, 0.0)) / jnp.sum(jnp.where(at, before, 0.0))
+        return last[3] + jnp.log(jnp.abs(jnp.where(end < n, ratio, 1.0)))
+
+    columns = chain.codes, chain.ends, chain.mesh, following_codes(chain), z
+    return jnp.where(chain.used, arc_by_arc(one)((osc,), columns), 0.0)
 
 
 def _product(maps: Array) -> Array:

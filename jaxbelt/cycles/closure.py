@@ -177,3 +177,16 @@ def admissible(osc: Oscillator, chain: Chain, z: Array) -> Array:
     lasts = after_each(chain, z[:, 2]) > LASTS
     each = jax.vmap(one)(chain.codes, chain.ends, z, exits, following_codes(chain), lasts)
     return jnp.all(each | ~chain.used)
+
+
+def passes_extremum(osc: Oscillator, chain: Chain, z: Array) -> Array:
+    """Whether an arc of a solution that slips passes an extremum of x2, where none ends: along it
+    x2' changes its sign."""
+
+    def one(codes, entry, exit_):
+        mode = mode_of(codes)
+        ends = [mode_acceleration(osc, mode, y[0], y[1]) for y in (entry, exit_)]
+        return ~mode.any_stuck & (jnp.minimum(*ends) < -HOLDS) & (jnp.maximum(*ends) > HOLDS)
+
+    passes = jax.vmap(one)(chain.codes, z[:, :2], jnp.roll(z[:, :2], -1, axis=0))
+    return jnp.any(passes & chain.used)

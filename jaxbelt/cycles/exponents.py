@@ -2,10 +2,10 @@
 
 The orbit is followed period by period, and the derivative of the state at the end of each period by
 that at its beginning is the product of the maps of its arcs, see `clocked`, in which saltation is
-contained. Two tangents are carried along and made orthogonal after each period; the exponents are
-the mean logarithms of what the factorisation leaves on its diagonal. Behind a stick phase the maps
-have rank one: then the second exponent is -inf, which follows from the kind of arcs, not from
-rounding.
+contained. A tangent is carried along, and the first exponent is the mean logarithm of its growth;
+both together are that of areas, which follows from the divergence of the field and is not lost in
+rounding where one direction shrinks much faster than the other. Behind a stick phase the maps have
+rank one: then the second exponent is -inf, which follows from the kind of arcs, too.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -26,7 +26,14 @@ from ..numerics.compiling import jit
 from ..results import Status, describe, draw
 from ..tables import require_single, table_of
 from .chains import Loop
-from .clocked import arc_maps, forcing_period, least_steps, timed_chain, turns_of
+from .clocked import (
+    arc_maps,
+    forcing_period,
+    least_steps,
+    logs_of_areas,
+    timed_chain,
+    turns_of,
+)
 from .followed import Followed, after_period, arcs_over
 
 if TYPE_CHECKING:
@@ -103,7 +110,7 @@ def lyapunov(
         y0: Start (x1, x2) at the phase 0, that is, at t = 0, shape [2].
         periods: Periods of the forcing that are averaged.
         transient: Periods before these that are not.
-        key: A key of `jax.random` for the first tangents; None: always the same ones.
+        key: A key of `jax.random` for the first tangent; None: always the same one.
 
     Returns:
         Both exponents with standard errors. A motion that stays bounded, and has settled, is
@@ -129,7 +136,7 @@ def lyapunov(
     length = 1.0 if own is osc else own.units.length
     y, skipped, passed = np.asarray(y0) / np.asarray(length), 0, 0
     logs, sticks, status = [], False, Status.OK.value
-    frame = _first_tangents(key)
+    tangent = _first_tangent(key)
     while passed < periods:
         followed = arcs_over(own, y, turns)
         reached = len(followed.starts) - 1
@@ -140,7 +147,7 @@ def lyapunov(
         skipped = min(transient, skipped + reached)
         if used > 0:
             sticks = sticks or bool(np.any(followed.last(used).codes == STUCK))
-        frame, grown = _followed_tangents(own, followed, turns, frame, used)
+        tangent, grown = _followed_tangent(own, followed, turns, tangent, used)
         logs.append(grown)
         passed += used
         y = after_period(own, followed)
@@ -154,35 +161,38 @@ def lyapunov(
     )
 
 
-def _first_tangents(key: Any) -> np.ndarray:
-    """Two orthogonal tangents, as columns."""
+def _first_tangent(key: Any) -> np.ndarray:
     angle = 1.0 if key is None else float(jax.random.uniform(key, maxval=2 * np.pi))
-    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return np.array([np.cos(angle), np.sin(angle)])
 
 
-def _followed_tangents(
-    osc: Oscillator, followed: Followed, turns: int, frame: np.ndarray, used: int
+def _followed_tangent(
+    osc: Oscillator, followed: Followed, turns: int, tangent: np.ndarray, used: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The tangents at the end of an orbit, and the logarithms of how much they grew in the last
-    periods of it, [used, 2]."""
+    """The tangent at the end of an orbit, of size one, and the logarithms of how much it grew in
+    the last periods of it, and a second one in an area with it, [used, 2]."""
     loop = followed.loop()
-    maps = np.asarray(_maps(osc, loop, least_steps(osc, loop), turns))[: len(followed.ends)]
+    found = _maps(osc, loop, least_steps(osc, loop), turns)
+    maps, areas = (np.asarray(one)[: len(followed.ends)] for one in found)
     ends = np.flatnonzero(followed.ends == Ends(followed.codes.shape[1]).period)
-    logs, total, place = [], np.eye(3), 0
-    for row, one in enumerate(maps):
-        total = one @ total
-        if row == ends[place]:
-            frame, factors = np.linalg.qr(total[:2, :2] @ frame)
-            with np.errstate(divide="ignore"):
-                logs.append(np.log(np.abs(np.diag(factors))))
-            total, place = np.eye(3), place + 1
-    return frame, np.array(logs[len(logs) - used :]).reshape(-1, 2)
+    begins = [0, *(ends[:-1] + 1).tolist()]
+    logs = []
+    for first, last in zip(begins, ends.tolist(), strict=True):
+        moved = np.append(tangent, 0.0)
+        for one in maps[first : last + 1]:
+            moved = one @ moved
+        size = np.hypot(*moved[:2])
+        tangent = moved[:2] / size if size > 0 else tangent
+        with np.errstate(divide="ignore", invalid="ignore"):
+            grown = np.log(size)
+            logs.append([grown, np.sum(areas[first : last + 1]) - grown])
+    return tangent, np.array(logs[len(logs) - used :]).reshape(-1, 2)
 
 
 @jit
-def _maps(osc: Oscillator, loop: Loop, size: int, turns: int) -> Array:
+def _maps(osc: Oscillator, loop: Loop, size: int, turns: int) -> tuple[Array, Array]:
     chain, z = timed_chain(osc, loop, size, turns)
-    return arc_maps(osc, chain, z)
+    return arc_maps(osc, chain, z), logs_of_areas(osc, chain, z)
 
 
 def _averaged(logs, sticks, status, periods, period, end) -> Exponents:

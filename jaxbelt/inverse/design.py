@@ -43,7 +43,8 @@ from .selection import ITERATIONS, LONGEST_CHANGE, Selection, progress_reporter,
 if TYPE_CHECKING:
     import pandas
 
-#: A target counts as met within this fraction of its size (of 1, where the size is smaller).
+#: A target counts as met within this fraction of the larger of what is wanted and what the first
+#: cycle has, of 1 where both are 0.
 MET = 1e-9
 
 
@@ -242,10 +243,11 @@ def design(
         return u + step * min(1.0, LONGEST_CHANGE / max(np.max(np.abs(step)), 1e-300))
 
     achieved, slopes, cycle = evaluate(u, y0)
-    # The unit of a miss is the largest known number of its target.
-    known = np.column_stack([np.asarray(achieved), intervals])
-    sizes = np.max(np.abs(np.where(np.isfinite(known), known, 0.0)), axis=1)
-    sizes = np.where(sizes > 0, sizes, 1.0)
+    # The unit of a miss; of an interval its nearer end counts.
+    sizes = np.ones(len(intervals))
+    known = np.stack([np.asarray(achieved), off(np.asarray(achieved))[1]])
+    largest = np.max(np.abs(np.where(np.isfinite(known), known, 0.0)), axis=0)
+    sizes = np.where(largest > 0, largest, 1.0)
     miss, wanted = off(np.asarray(achieved))
     damping, iterations, idle = 1e-3, 0, 0
     while iterations < 2 * ITERATIONS and idle < 5:

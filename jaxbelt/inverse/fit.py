@@ -45,7 +45,16 @@ from .selection import (
     progress_reporter,
     selection_of,
 )
-from .windows import GAIN_LEFT, FitPoint, Linearization, fit_windows, gain_left, known_directions
+from .windows import (
+    GAIN_LEFT,
+    FitPoint,
+    Linearization,
+    at_bounds,
+    fit_windows,
+    free_part,
+    gain_left,
+    known_directions,
+)
 
 if TYPE_CHECKING:
     import pandas
@@ -73,7 +82,8 @@ class Fit(eqx.Module):
         oscillator: The oscillator with the estimates in it.
         names: Names of the parameters, in the order of `where`.
         estimates: Their estimates, [p].
-        standard_errors: Standard errors of the estimates, [p].
+        standard_errors: Standard errors of the estimates, [p]; 0 of one at a bound beyond which the
+            record would fit better: it is held there, and the others' are those beside it.
         covariance: Covariance of the estimates, [p, p].
         y0: Estimated state (x1, x2) at the first time, [2].
         y0_standard_errors: Its standard errors, [2].
@@ -264,9 +274,10 @@ def fit(
         noise: Standard deviation of the data, a pair where both x1 and x2 are given. None estimates
             it from the scatter of neighbouring data about a smooth curve, for which a loop needs
             some tens of data.
-        bounds: For each parameter (lower, upper) or None; None keeps positive what cannot be
-            negative. Parameters stay inside by a change of variables, so an estimate at a bound is
-            one that would be outside without it.
+        bounds: For each parameter (lower, upper) or None; None keeps it where the oscillator is
+            possible: what cannot be negative positive, a contact edge on its side of the other one
+            if that is not selected, too. Parameters stay inside by a change of
+            variables, so an estimate at a bound is one that would be outside without it.
         starts: Number of starts of the search, spread about the guess.
         report: Function that is called with lines on the progress, such as `print`.
 
@@ -424,14 +435,18 @@ def _result(
     u = jnp.asarray(point.u)
     estimates = selection.values(u)
     slopes = np.append(np.diag(jax.jacfwd(selection.values)(u)), [1.0, 1.0])
-    covariance = _inverted(point.blocks[0, :-1, :-1]) * slopes[:, None] * slopes
+    free = np.append(~at_bounds(selection, point), [True] * 2)
+    block = free_part(selection, point)
+    covariance = np.zeros((p + 2, p + 2))
+    covariance[np.ix_(free, free)] = _inverted(block[:-1, :-1])
+    covariance *= slopes[:, None] * slopes
     errors = np.sqrt(np.diag(covariance))
     ys, weights = _motion_of(point, values), _weights_of(record, values)
     status = Status.OK if verdict.is_noise else Status.MISFIT
     if status == Status.OK:  # Errors of a misfit mean nothing.
         if not np.all(errors[:p] <= parameter_sizes(estimates, selection.unit)):
             status = Status.NOT_IDENTIFIED
-        elif not gain_left(point.blocks[0]) < GAIN_LEFT:
+        elif not gain_left(block) < GAIN_LEFT:
             status = Status.NO_CONVERGENCE
     status = status if np.isfinite(point.chi2) else Status.NOT_FINITE
     with np.errstate(divide="ignore"):

@@ -18,6 +18,8 @@ from ..model.variations import Variation
 
 #: Largest number of damped Newton steps, and the longest step, in units of `Selection.values`' u.
 ITERATIONS, LONGEST_CHANGE = 40, 0.4
+#: Bisections by which the end of an interval of possible values is found.
+BISECTIONS = 40
 #: Smallest size of a parameter, in its own unit; used where its value is nearer to zero.
 SMALLEST = 0.1
 
@@ -100,7 +102,7 @@ def selection_of(
     for group, name, value, pair in zip(
         groups, names, values, _pairs_of(bounds, names), strict=True
     ):
-        lower, upper = (_lower_bound(osc, group[0]), np.inf) if pair is None else pair
+        lower, upper = _interval(osc, group, groups) if pair is None else pair
         require(np.isfinite(value), name, "finite, as a guess", f"{value:.12g}")
         inside = f"inside of its bounds ({lower:.12g}, {upper:.12g})"
         require(lower < value < upper, name, inside, f"{value:.12g}")
@@ -168,12 +170,51 @@ def _pairs_of(bounds: Any, names: Sequence[str]) -> list[tuple[float, float] | N
     return pairs
 
 
-def _lower_bound(osc: Oscillator, leaf: int) -> float:
-    """Lower bound of a leaf: 0 if the oscillator's checks refuse negative values, else -inf."""
+def _interval(
+    osc: Oscillator, group: Sequence[int], groups: Sequence[Sequence[int]]
+) -> tuple[float, float]:
+    """The interval in which the oscillator's checks allow leaves that are kept equal: with the
+    leaves of the other groups moved, or stretched, alike or as they are, and all other leaves as
+    they are. Exact where it ends at 0, at another leaf, or at the negative of one."""
     leaves, structure = jax.tree.flatten(osc)
-    leaves[leaf] = jnp.asarray(-1.0)
-    try:
-        jax.tree.unflatten(structure, leaves).check()
-    except ValueError:
-        return 0.0
-    return -np.inf
+    known = np.array([float(leaf) for leaf in leaves if np.ndim(leaf) == 0])
+    value = float(leaves[group[0]])
+    marks = np.append(np.abs(known[np.isfinite(known)]), 0.0)
+    marks = np.unique(np.append(-marks, marks))
+
+    others = {leaf for one in groups for leaf in one} - set(group)
+
+    def passes(number, moved):
+        given = list(leaves)
+        for leaf in others:
+            given[leaf] = jnp.asarray(moved(float(leaves[leaf])))
+        for leaf in group:
+            given[leaf] = jnp.asarray(number)
+        try:
+            jax.tree.unflatten(structure, given).check()
+        except ValueError:
+            return False
+        return True
+
+    def is_possible(number):
+        ratio = number / value if value else 1.0
+        ways = (lambda x: x), (lambda x: x + number - value), (lambda x: x * ratio)
+        return any(passes(number, moved) for moved in ways[: 3 if others else 1])
+
+    def end(sign):
+        ahead = np.sort(sign * marks[sign * marks >= sign * value])
+        inside = sign * value
+        for outside in (0.5 * (ahead + np.append(ahead[1:], ahead[-1:] + 2.0))).tolist():
+            if not is_possible(sign * outside):
+                break
+            inside = outside
+        else:
+            return sign * np.inf
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (inside + outside)
+            inside, outside = (middle, outside) if is_possible(sign * middle) else (inside, middle)
+        nearest = float(marks[np.argmin(np.abs(marks - sign * outside))])
+        is_mark = abs(nearest - sign * outside) <= 2.0 ** (2 - BISECTIONS) * (1 + abs(nearest))
+        return nearest if is_mark else sign * inside
+
+    return end(-1.0), end(1.0)

@@ -17,6 +17,7 @@ from .selection import (
     ITERATIONS,
     LONGEST_CHANGE,
     Selection,
+    parameter_sizes,
 )
 
 TOLERANCE = 1e-8
@@ -24,6 +25,8 @@ TOLERANCE = 1e-8
 #: lower chi^2 by less than GAIN_ENOUGH, the square of an error in standard errors; it has not
 #: converged where the step promises more than GAIN_LEFT.
 LONGER, GAIN_ENOUGH, GAIN_LEFT = 10, 1e-5, 1e-1
+#: A parameter that is so near to its bound, in parts of its size, is at it.
+AT_BOUND = 1e-6
 #: Factors by which the damping shrinks and grows: along a bent valley a large one is refused at
 #: every other step.
 LESS_DAMPED, MORE_DAMPED = 3.0, 4.0
@@ -152,7 +155,7 @@ def fit_windows(
             break
         if number >= ITERATIONS and point.chi2 > far:
             break
-        if is_last and gain_left(point.blocks[0]) < GAIN_ENOUGH:
+        if is_last and gain_left(free_part(problem.selection, point)) < GAIN_ENOUGH:
             break
         # The x2 of a start at which the mass sticks loses its effect on the way there: so with a
         # clock the largest squares of the iteration damp its steps (More, 1978).
@@ -173,6 +176,22 @@ def fit_windows(
         else:
             damping *= MORE_DAMPED
     return point
+
+
+def at_bounds(selection: Selection, point: FitPoint) -> np.ndarray:
+    """Which parameters are at a bound, beyond which a whole record fits better, [p]."""
+    p = point.u.size
+    values = np.asarray(selection.values(jnp.asarray(point.u)))
+    reached = AT_BOUND * np.asarray(parameter_sizes(values, selection.unit))
+    slope = point.blocks[0, :p, -1]
+    lower, upper = np.asarray(selection.lower), np.asarray(selection.upper)
+    return ((values - lower < reached) & (slope > 0)) | ((upper - values < reached) & (slope < 0))
+
+
+def free_part(selection: Selection, point: FitPoint) -> np.ndarray:
+    """The block of a whole record without the parameters that are at bounds."""
+    free = np.append(~at_bounds(selection, point), [True] * 3)
+    return point.blocks[0][np.ix_(free, free)]
 
 
 def gain_left(block: np.ndarray) -> float:

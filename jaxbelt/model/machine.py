@@ -216,7 +216,7 @@ class Machine(KnownNames):
         """
         x1, x2 = _si_numbers(displacement, "displacement"), _si_numbers(velocity, "velocity")
         units = self.units
-        return x1 / units.length, x2 / units.velocity
+        return _over(x1, units.length), _over(x2, units.velocity)
 
     def tau(self, time: ArrayLike) -> Array:
         """The dimensionless time tau.
@@ -227,7 +227,7 @@ class Machine(KnownNames):
         Returns:
             The time, of the same shape.
         """
-        return _si_numbers(time, "time") / self.units.time
+        return _over(_si_numbers(time, "time"), self.units.time)
 
     def of_oscillator(self, osc: Oscillator) -> "Machine":
         """This machine with the numbers of a dimensionless oscillator, such as that of a fit.
@@ -286,3 +286,11 @@ def _si_numbers(value: Any, field: str) -> Array:
     is_number = isinstance(value, jax.Array) or np.asarray(value).dtype.kind in "iuf"
     require_value(is_number, field, "a number", value)
     return jnp.asarray(value)
+
+
+def _over(value: Array, unit: Array) -> Array:
+    """A quotient that is the same for a number and as one of many, which XLA may multiply by the
+    reciprocal."""
+    if is_concrete((value, unit)):
+        return jnp.asarray(np.asarray(value) / np.asarray(unit))
+    return value / unit

@@ -6,6 +6,7 @@ and ends a run as soon as it knows one. Where there is none until the end of the
 exponent decides.
 """
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import ClassVar
@@ -64,8 +65,9 @@ STEADY, STEADY_CHAOS = 0.01, 0.2
 #: The logarithm of how much a tangent grows, at least, while the exponent of chaos is measured: a
 #: motion that grew as much would be seen to grow.
 GROWTH_OF_CHAOS = 10.0
-#: Growth of a tangent, its logarithm, that is rounding.
-STILL = 1e-9
+#: Growth of a tangent, its logarithm, that is rounding; its error in a unit of time, which hardly
+#: depends on the tolerance: 4e-6 were seen with steep laws of friction, 1e-9 with Coulomb's.
+STILL, ERRORS_OF_GROWTH = 1e-9, 1e-5
 #: Shares of the time that the mass does not stick, and differences of states, that are rounding.
 CARRIED, STANDS_STILL = 1e-9, 1e-13
 #: An extremum is known from a point that is this near in time; steps are cut until there is one.
@@ -79,8 +81,9 @@ class _Repeats(eqx.Module):
 
     x1, x2: the state that later ones are compared with, of the strobe `at`; patience: strobes until
     it is given up; n: strobes after which the motion seems to repeat, 0: not yet; confirmed:
-    strobes over which it has; log: of the tangent's growth when these began; moved: how far the
-    last repeat was from its own; nearest: the smallest distance of another strobe.
+    strobes over which it has; asked: how many these were when growth was asked for again, 0: not
+    yet; log: of the tangent's growth when these began, or were asked; moved: how far the last
+    repeat was from its own; nearest: the smallest distance of another strobe.
     """
 
     x1: Array
@@ -89,6 +92,7 @@ class _Repeats(eqx.Module):
     patience: Array
     n: Array
     confirmed: Array
+    asked: Array
     log: Array
     moved: Array
     nearest: Array
@@ -183,7 +187,7 @@ class ForcedAttractor(Observer):
         nowhere, never = zero + jnp.nan, jnp.full_like(count, -1)
         patience = count + FIRST_PATIENCE
         far = zero + jnp.inf
-        repeats = _Repeats(nowhere, nowhere, never, patience, count, count, zero, zero, far)
+        repeats = _Repeats(nowhere, nowhere, never, patience, count, count, count, zero, zero, far)
         winding = Winding.none(lanes)
         return _RunSoFar(
             strobes=(passed + 1).astype(count.dtype),
@@ -312,10 +316,19 @@ class ForcedAttractor(Observer):
         carried = sum(extent.sticks) >= (1 - CARRIED) * elapsed
         found = found & (~carried | (away <= STANDS_STILL * (1 + jnp.abs(x1))))
         # Nothing pulls a motion to one that lies beside others which repeat as well, and one from
-        # which a tangent leads away is no attractor.
-        gained = seen.growth.size - known.log
-        found = found & (gained < STILL)
-        kind = jnp.where(gained < -STILL, PERIODIC, FORCED_CONTINUUM)
+        # which a tangent leads away is no attractor. A tangent that has shrunk once, as it did in a
+        # stick phase on the way, has to shrink again, in as many strobes at most.
+        vanished = seen.growth.size == -jnp.inf
+        gained = jnp.where(vanished, -jnp.inf, seen.growth.size - known.log)
+        asked_for = (confirmed - known.asked).astype(x1.dtype) * _strobe_period(osc, seen.turns)
+        doubt = STILL + ERRORS_OF_GROWTH * asked_for
+        found = found & (gained < doubt)
+        shrunk = gained < -doubt
+        asks = found & shrunk & (known.asked == 0) & ~vanished
+        waits = (known.asked > 0) & ~shrunk & (confirmed < 2 * known.asked)
+        kind = jnp.where(shrunk, PERIODIC, FORCED_CONTINUUM)
+        found = found & ~asks & ~waits
+        asked = jnp.where(asks, confirmed, jnp.where(fresh & ~again, 0, known.asked))
         repeats = _Repeats(
             x1=jnp.where(fresh, x1, known.x1),
             x2=jnp.where(fresh, x2, known.x2),
@@ -323,7 +336,8 @@ class ForcedAttractor(Observer):
             patience=jnp.where(expired & (known.at >= 0), 2 * known.patience, known.patience),
             n=n.astype(known.n.dtype),
             confirmed=confirmed.astype(known.n.dtype),
-            log=jnp.where(fresh & ~again, seen.growth.size, known.log),
+            asked=asked.astype(known.n.dtype),
+            log=jnp.where(fresh & ~again | asks, seen.growth.size, known.log),
             moved=jnp.where(again | sooner, away, jnp.where(fresh, jnp.inf, known.moved)),
             nearest=jnp.where(fresh, jnp.inf, nearest),
         )
@@ -418,14 +432,16 @@ class ForcedAttractor(Observer):
 def common_turns(waves: Sequence[Array], none: Array) -> Array:
     """As `turns_of`, by the frequencies, of each lane, as numbers like `none`, its 0 where there is
     no such period."""
-    first, *others = (jnp.broadcast_to(one, none.shape)[..., None] for one in waves)
-    turns = jnp.arange(1, RATIOS + 1, dtype=first.dtype).reshape((1,) * none.ndim + (RATIOS,))
+    found = [jnp.abs(jnp.broadcast_to(one, none.shape)) for one in waves]
+    slowest = functools.reduce(jnp.minimum, found)
+    ratios = [one / slowest for one in found]
+    count = jnp.arange(1, RATIOS + 1, dtype=slowest.dtype).reshape((1,) * none.ndim + (RATIOS,))
     whole = jnp.ones((*none.shape, RATIOS), bool)
-    for other in others:
-        ratio = jnp.abs(turns * other / first)
-        whole = whole & (jnp.abs(ratio - jnp.round(ratio)) <= RATIO_ROUNDING * ratio)
-    smallest = 1 + jnp.argmax(whole, axis=-1)
-    return jnp.where(jnp.any(whole, axis=-1), smallest, 0).astype(none.dtype)
+    for ratio in ratios:
+        passed = count * ratio[..., None]
+        whole = whole & (jnp.abs(passed - jnp.round(passed)) <= RATIO_ROUNDING * passed)
+    turns = jnp.round((1 + jnp.argmax(whole, axis=-1)).astype(slowest.dtype) * ratios[0])
+    return jnp.where(jnp.any(whole, axis=-1), turns, 0).astype(none.dtype)
 
 
 def _strobe_period(osc: OwnOscillator, turns: Array) -> Array:
