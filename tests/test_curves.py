@@ -443,7 +443,7 @@ def test_a_corner_is_no_second_contact_of_its_own():
     assert corners
     for corner in corners:
         spans = (0.09, 0.0935), (-0.005, 0.001)
-        curve = jb.bifurcation_curve(corner, (nu0, nu1), spans, step=0.005)
+        curve = jb.bifurcation_curve(corner(0.6), (nu0, nu1), spans, step=0.005)
         (rest,) = curve.special
         assert (rest.kind, rest.belts) == ("BeltAtRest", (1,)) and rest.residual < 1e-8
 
@@ -522,32 +522,33 @@ def with_an_edge(sigma, velocity):
     return jb.presets.class_d(0.35, velocity, 0.0, sigma)
 
 
-@pytest.fixture(scope="module")
-def corner():
-    return jb.refine(jb.CornerCollision(0), lambda sigma: with_an_edge(sigma, 0.2), at=0.9)
+def corner(at):
+    return jb.refine(jb.CornerCollision(0), lambda sigma: with_an_edge(sigma, 0.2), at=at)
 
 
 @pytest.mark.slow(first=True)
 @pytest.mark.parametrize("step", [0.01, 0.02])
 @pytest.mark.parametrize("is_swapped", [False, True])
-def test_a_curve_goes_on_where_its_cycle_is_there_only_just_beside_it(corner, step, is_swapped):
+def test_a_curve_goes_on_where_its_cycle_is_there_only_just_beside_it(step, is_swapped):
     """Behind belts of one velocity guesses from which to begin are few; both orders agree."""
     span = (0.3, 1.5), (-0.3, 0.6)
     if is_swapped:
-        curve = jb.bifurcation_curve(corner, lambda v, s: with_an_edge(s, v), span[::-1], step=step)
+        curve = jb.bifurcation_curve(
+            corner(0.6), lambda v, s: with_an_edge(s, v), span[::-1], step=step
+        )
     else:
-        curve = jb.bifurcation_curve(corner, with_an_edge, span, step=step)
+        curve = jb.bifurcation_curve(corner(0.6), with_an_edge, span, step=step)
     values = curve.values[:, ::-1] if is_swapped else curve.values
     assert Stop.LEFT_SPAN in curve.ends
     last = values[np.argmax(values[:, 0])]
     np.testing.assert_allclose(last, [1.5, 0.4210273673315], rtol=0, atol=1e-11)
 
 
-def test_places_are_those_of_the_cycles_beside(corner):
+@pytest.mark.slow
+def test_places_are_those_of_the_cycles_beside():
     """Where x2 has got an extremum within an arc its smallest value was that of an event."""
-    curve = jb.bifurcation_curve(
-        corner, with_an_edge, ((0.55, 1.0), (0.04, 0.3)), step=0.03, max_points=25
-    )
+    span = (0.55, 1.0), (0.04, 0.3)
+    curve = jb.bifurcation_curve(corner(0.9), with_an_edge, span, step=0.03)
     known = 0
     for (sigma, velocity), place in zip(curve.values, curve.places, strict=True):
         for side in (1e-7, -1e-7):
@@ -556,7 +557,7 @@ def test_places_are_those_of_the_cycles_beside(corner):
             if int(cycle.status) == jb.Status.OK and abs(cycle.x1_max - place[1]) < 1e-3:
                 np.testing.assert_allclose(numbers, place, rtol=0, atol=2e-4)
                 known += 1
-    assert known > 20 and np.ptp(curve.places[:, 2]) > 0.05
+    assert known > len(curve) // 2 and np.ptp(curve.places[:, 2]) > 0.05
 
 
 @pytest.mark.parametrize("count", [1, 2, 11, 12])

@@ -79,8 +79,8 @@ class PeriodicMotion(ClosedMotion):
             another phase, `chain.share` of a period.
         unknowns: (x1, x2, t, duration) at the entry of every arc, t counted from the last phase 0
             before the arcs of a period begin, [arcs, 4].
-        multipliers: Both Floquet multipliers, complex, the larger one first; both are known to about
-            1e-15 of it, and areas that shrink more only by `lyapunov`. Of a motion that sticks the
+        multipliers: Both Floquet multipliers, complex, the larger one first; both to about 1e-15 of
+            it, beyond which only `lyapunov` knows how areas shrink. Of a motion that sticks the
             second is exactly 0.
         residual: Largest error in the equations.
         iterations: Newton steps.
