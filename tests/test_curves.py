@@ -443,7 +443,7 @@ def test_a_corner_is_no_second_contact_of_its_own():
     assert corners
     for corner in corners:
         spans = (0.09, 0.0935), (-0.005, 0.001)
-        curve = jb.bifurcation_curve(corner(0.6), (nu0, nu1), spans, step=0.005)
+        curve = jb.bifurcation_curve(corner, (nu0, nu1), spans, step=0.005)
         (rest,) = curve.special
         assert (rest.kind, rest.belts) == ("BeltAtRest", (1,)) and rest.residual < 1e-8
 
@@ -531,13 +531,10 @@ def corner(at):
 @pytest.mark.parametrize("is_swapped", [False, True])
 def test_a_curve_goes_on_where_its_cycle_is_there_only_just_beside_it(step, is_swapped):
     """Behind belts of one velocity guesses from which to begin are few; both orders agree."""
-    span = (0.3, 1.5), (-0.3, 0.6)
+    make, span = with_an_edge, ((0.3, 1.5), (-0.3, 0.6))
     if is_swapped:
-        curve = jb.bifurcation_curve(
-            corner(0.6), lambda v, s: with_an_edge(s, v), span[::-1], step=step
-        )
-    else:
-        curve = jb.bifurcation_curve(corner(0.6), with_an_edge, span, step=step)
+        make, span = (lambda v, s: with_an_edge(s, v)), span[::-1]
+    curve = jb.bifurcation_curve(corner(0.6), make, span, step=step)
     values = curve.values[:, ::-1] if is_swapped else curve.values
     assert Stop.LEFT_SPAN in curve.ends
     last = values[np.argmax(values[:, 0])]
