@@ -95,6 +95,12 @@ def _sticking():
     return jb.find_cycle(FORCED(1.68), FROM)
 
 
+@functools.cache
+def _doubling():
+    """A point in which motions of twice the period leave others."""
+    return jb.refine(jb.PeriodDoubling(), FORCED, at=1.71)
+
+
 BATCH = jnp.linspace(0.3, 0.6, 1024)
 STARTS = np.linspace(-3.0, 3.0, 256)
 FINALS = jax.jit(jax.vmap(_end))
@@ -252,6 +258,13 @@ QUESTIONS = [
         lambda: jb.bifurcation_diagram(FORCED(1.68), frequency, (1.675, 1.69), start=_sticking()),
         1,
         "branch",
+    ),
+    Question(
+        "bifurcation_curve, forced",
+        "a period doubling followed in two parameters",
+        lambda: jb.bifurcation_curve(_doubling(), FORCED, ((1.6, 1.9), (0.02, 0.2))),
+        1,
+        "curve",
     ),
     Question(
         "lyapunov",

@@ -212,7 +212,8 @@ def bifurcation_curve(
         at: Values (p, q) near the point; needed only where one oscillator is at several places of
             the plane (of `p**2`, for example).
         step: Largest distance between neighbours, in units of the parameters in which a change by 1
-            changes some number of the dimensionless oscillator by 1, and none by more.
+            changes some number of the dimensionless oscillator by 1, and none by more; up to a
+            factor of two, by the unit of length.
         max_points: Largest number of points on each side; `ends` says where it cut the curve off.
 
     Returns:

@@ -152,8 +152,8 @@ class ForcedAttractor(Observer):
     """What a forced run leads to; it ends as soon as that is known.
 
     - A periodic motion: its states at strobes repeat, all of them, over `CONFIRMED` strobes and two
-      of its periods; no state in between is the same; and what is left of the approach, by the rate
-      at which it shrinks, is below `SAME` of its size.
+      of its periods; no state in between is the same; what is left of the approach, by the rate at
+      which it shrinks, is below `SAME` of its size; and a tangent has shrunk and shrinks again.
     - None of these: one of a continuum of motions, where a tangent keeps its size while the motion
       repeats, or always. It attracts nothing, and the run ends undecided with the status NEUTRAL.
     - Stuck for ever, or at rest on an edge that pushes back from both sides at all times.
