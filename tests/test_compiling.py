@@ -17,6 +17,7 @@ from compilations import compilations
 from jax import lax
 
 import jaxbelt as jb
+from jaxbelt.cycles import clocked
 from jaxbelt.model.own_units import in_own_units
 from jaxbelt.numerics import compiling, programs
 
@@ -322,6 +323,36 @@ def test_what_cannot_be_one_piece_is_what_it_was(function):
     np.testing.assert_allclose(jax.jit(compiling.one_kernel(function))(x), function(x), rtol=1e-13)
     if jax.default_backend() == "cpu":
         assert MARK not in program(compiling.one_kernel(function), x)
+
+
+@needs_tricks
+def test_shooting_with_a_clock_is_one_piece(monkeypatch):
+    """With the longest meshes, too; a scattered number in an equation kept all of it from that."""
+    judged, is_possible = [], compiling._is_possible
+
+    def noted(jaxpr):
+        judged.append(is_possible(jaxpr))
+        return judged[-1]
+
+    monkeypatch.setattr(compiling, "_is_possible", noted)
+    osc = in_own_units(jb.presets.den_hartog(0.8))
+    arcs, steps = 16, 512
+    codes, ends = jnp.ones((arcs, len(osc.belts))), jnp.zeros(arcs, int)
+    chain = clocked.TimedChain(codes, ends, jnp.ones((arcs, steps)) / steps, turns=1)
+    z = jnp.ones((arcs, 4))
+    functions = {
+        "equations": lambda z: clocked.timed_residual(osc, chain, z),
+        "derivatives": lambda z: clocked.timed_blocks(osc, osc, chain, z),
+        "maps": lambda z: clocked.arc_maps(osc, chain, z),
+        "slopes": lambda z: clocked.monodromy_and_slopes(osc, osc, chain, z),
+        "areas": lambda z: clocked.logs_of_areas(osc, chain, z),
+        "admissible": lambda z: clocked.timed_admissible(osc, chain, z),
+        "extrema": lambda z: clocked.extrema_along(osc, chain, z),
+    }
+    for name, function in functions.items():
+        judged.clear()
+        jax.make_jaxpr(function)(z)
+        assert judged and judged[-1], name
 
 
 # --- without what is not promised -----------------------------------------------------------------
