@@ -10,6 +10,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     results         status codes and advice
     activity        progress of functions that take long
     identity        fingerprints of values and functions
+    interrupts      interrupts that are not lost
     numerics/       spacing widths programs compiling
     checks          arguments, checked at the public edge
     dimensions      dimensions of fields and results

@@ -1,6 +1,7 @@
 """Ctrl-C: every sweep is back at the prompt soon, and says what became of its runs."""
 
 import gc
+import importlib
 import os
 import signal
 import subprocess
@@ -13,6 +14,7 @@ import pytest
 
 import jaxbelt as jb
 from jaxbelt.commands.options import GRACE
+from jaxbelt.interrupts import heard_interrupts
 from jaxbelt.sweeps import store, threads
 from jaxbelt.sweeps.datasets import Memory
 from jaxbelt.sweeps.question import Question
@@ -169,7 +171,6 @@ def test_interrupts_of_a_session_lose_nothing(tmp_path, monkeypatch):
     assert told["interrupted"] == 3 and told["longest"] < SOON
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("where", [(threads, "wait"), (Question, "of"), (Memory, "dataset")])
 def test_an_interrupt_in_a_callback_of_the_garbage_collector_is_not_lost(monkeypatch, where):
     """Python would print that it is ignored, and the sweep would go on to its end."""
@@ -192,4 +193,15 @@ def test_an_interrupt_in_a_callback_of_the_garbage_collector_is_not_lost(monkeyp
     with pytest.raises(KeyboardInterrupt, match="interrupted"):
         jb.sweep(jb.presets.class_b, {"nu0": [0.3], "nu1": [0.2]}, t1=1.0, observe="final")
     assert sent
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_an_interrupt_comes_after_an_import_that_is_under_way(tmp_path, monkeypatch):
+    """An extension whose first steps are interrupted raises what no one expects, or crashes."""
+    lines = "import os, signal", "os.kill(os.getpid(), signal.SIGINT)", "is_whole = True"
+    (tmp_path / "interrupted_module.py").write_text("\n".join(lines))
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(KeyboardInterrupt), heard_interrupts(at_once=True):
+        module = importlib.import_module("interrupted_module")
+    assert module.is_whole
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

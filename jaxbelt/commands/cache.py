@@ -19,10 +19,10 @@ def cache(
 
     Example: **jaxbelt cache --clear**
     """
-    # Imported late, because JAX comes with it, to keep `--help` quick.
-    from ..numerics import programs
-
     with plain_errors():
+        # Imported late, because JAX comes with it, to keep `--help` quick.
+        from ..numerics import programs
+
         removed = programs.clear() if clear else 0
         words, data = what_is_kept()
     lines = [f"{removed} programs removed"] * clear + [words]

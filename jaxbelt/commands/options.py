@@ -22,6 +22,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from ..interrupts import heard_interrupts
 from ..spelling import did_you_mean
 
 
@@ -32,7 +33,7 @@ def plain_errors() -> Iterator[None]:
     An interrupt exits with code 130, as in shells.
     """
     try:
-        with _interrupts_that_count():
+        with _interrupts_that_count(), heard_interrupts(at_once=True):
             yield
     except KeyboardInterrupt as error:
         typer.secho(str(error) or "interrupted", err=True, fg=typer.colors.RED)

@@ -29,9 +29,9 @@ def reproduce(
         if out.exists() and not out.is_dir():
             raise ValueError(f"out must be a folder, got the file {out}")
         check_out(out / "critical_values.json")
-    turn_on_float64()
-    # Imported late, because matplotlib comes with it, to keep `--help` quick.
-    from .. import paper
+        turn_on_float64()
+        # Imported late, because matplotlib comes with it, to keep `--help` quick.
+        from .. import paper
 
     with plain_errors(), steps_bar(console, 32, as_json) as progress:
         task = progress.add_task("", total=paper.steps())

@@ -37,10 +37,10 @@ def warm(
 
     Example: **jaxbelt warm**
     """
-    turn_on_float64()
-    from ..numerics import programs
-
     with plain_errors():
+        turn_on_float64()
+        from ..numerics import programs
+
         if programs.folder() is None:
             raise ValueError(
                 "compiled programs must be kept on disk for this, but JAXBELT_CACHE=0 is set or "

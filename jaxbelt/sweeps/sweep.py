@@ -24,6 +24,7 @@ from ..checks import (
     require_value,
     require_wish,
 )
+from ..interrupts import heard_interrupts
 from ..model.oscillator import Oscillator
 from ..results import draw
 from ..tables import table_of
@@ -35,7 +36,7 @@ from .observers import Final
 from .progress import SweepProgress
 from .question import Question
 from .store import Store, blocks_of
-from .threads import CHUNK, heard_interrupts, run
+from .threads import CHUNK, run
 from .work import do_runs
 
 if TYPE_CHECKING:

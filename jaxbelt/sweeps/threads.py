@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..checks import require
+from ..interrupts import heard_interrupts
 from ..kernel.lanes import Program
 from ..kernel.rounds import STEPS_PER_ROUND
 from ..numerics.compiling import wide
@@ -283,49 +284,6 @@ def _end_of_process() -> None:
         signal.raise_signal(signal.SIGINT)
     for thread in tuple(_alive):
         thread.join()
-
-
-class _Handler:
-    """A handler of interrupts that notes them, and raises them if so wished."""
-
-    def __init__(self, came: threading.Event, at_once: bool):
-        self.came = came
-        self.at_once = at_once
-
-    def __call__(self, number, frame) -> None:
-        self.came.set()
-        if self.at_once:
-            signal.default_int_handler(number, frame)
-
-    def raise_noted(self) -> None:
-        if self.came.is_set():
-            raise KeyboardInterrupt
-
-
-@contextmanager
-def heard_interrupts(*, at_once: bool) -> Iterator[Callable[[], None]]:
-    """While the block runs no interrupt is lost; within another such block those of that one count.
-
-    Python raises an interrupt wherever the main thread is, and loses it in callbacks of its garbage
-    collector, such as JAX has. So it is noted, too, and raised by the function that is given, and
-    at the end of the block.
-
-    Args:
-        at_once: Whether interrupts are raised where they come, too.
-    """
-    before = signal.getsignal(signal.SIGINT)
-    is_ours = isinstance(before, _Handler)
-    is_usual = is_ours or before is signal.default_int_handler
-    if not is_usual or threading.current_thread() is not threading.main_thread():
-        yield lambda: None
-        return
-    handler = _Handler(before.came if is_ours else threading.Event(), at_once)
-    signal.signal(signal.SIGINT, handler)
-    try:
-        yield handler.raise_noted
-    finally:
-        signal.signal(signal.SIGINT, before)
-    handler.raise_noted()
 
 
 def _wait(futures: list[Future], watch: Callable[[], None]) -> None:
