@@ -81,9 +81,9 @@ class _Repeats(eqx.Module):
 
     x1, x2: the state that later ones are compared with, of the strobe `at`; patience: strobes until
     it is given up; n: strobes after which the motion seems to repeat, 0: not yet; confirmed:
-    strobes over which it has; asked: how many these were when growth was asked for again, 0: not
-    yet; log: of the tangent's growth when these began, or were asked; moved: how far the last
-    repeat was from its own; nearest: the smallest distance of another strobe.
+    strobes over which it has; asked: how many these were when half of them were over, 0: before;
+    log: of the tangent's growth when these began, or at their half; moved: how far the last repeat
+    was from its own; nearest: the smallest distance of another strobe.
     """
 
     x1: Array
@@ -153,7 +153,7 @@ class ForcedAttractor(Observer):
 
     - A periodic motion: its states at strobes repeat, all of them, over `CONFIRMED` strobes and two
       of its periods; no state in between is the same; what is left of the approach, by the rate at
-      which it shrinks, is below `SAME` of its size; and a tangent has shrunk and shrinks again.
+      which it shrinks, is below `SAME` of its size; and a tangent shrinks in their second half.
     - None of these: one of a continuum of motions, where a tangent keeps its size while the motion
       repeats, or always. It attracts nothing, and the run ends undecided with the status NEUTRAL.
     - Stuck for ever, or at rest on an edge that pushes back from both sides at all times.
@@ -310,22 +310,23 @@ class ForcedAttractor(Observer):
         # Errors hide how far it still goes where it comes nearer slowly, from both sides in turn.
         still = jnp.where(away <= errors, 0.0, APART * left)
         alone = (known.n == 1) | (nearest > still + APART_OF_ERRORS * errors)
-        found = again & settled & alone & (confirmed >= jnp.maximum(CONFIRMED, 2 * known.n))
+        least = jnp.maximum(CONFIRMED, 2 * known.n)
+        found = again & settled & alone & (confirmed >= least)
         # A mass that a belt carries is where it was if nothing but rounding says otherwise.
         elapsed = since.astype(x1.dtype) * _strobe_period(osc, seen.turns)
         carried = sum(extent.sticks) >= (1 - CARRIED) * elapsed
         found = found & (~carried | (away <= STANDS_STILL * (1 + jnp.abs(x1))))
         # Nothing pulls a motion to one that lies beside others which repeat as well, and one from
-        # which a tangent leads away is no attractor. A tangent that has shrunk once, as it did in a
-        # stick phase on the way, has to shrink again, in as many strobes at most.
+        # which a tangent leads away is no attractor. A tangent may be lost in a stick phase on the
+        # way, once; so its growth is asked for since half of these strobes.
         vanished = seen.growth.size == -jnp.inf
         gained = jnp.where(vanished, -jnp.inf, seen.growth.size - known.log)
         asked_for = (confirmed - known.asked).astype(x1.dtype) * _strobe_period(osc, seen.turns)
         doubt = STILL + ERRORS_OF_GROWTH * asked_for
         found = found & (gained < doubt)
         shrunk = gained < -doubt
-        asks = found & shrunk & (known.asked == 0) & ~vanished
-        waits = (known.asked > 0) & ~shrunk & (confirmed < 2 * known.asked)
+        asks = again & (known.asked == 0) & (2 * confirmed >= least) & ~vanished
+        waits = ~shrunk & (confirmed < 2 * known.asked)
         kind = jnp.where(shrunk, PERIODIC, FORCED_CONTINUUM)
         found = found & ~asks & ~waits
         asked = jnp.where(asks, confirmed, jnp.where(fresh & ~again, 0, known.asked))
