@@ -475,3 +475,15 @@ def test_the_unstable_branch_begins_at_its_fold():
     unstable = rows[(rows.kind == "cycle") & (rows.stable == False)]  # noqa: E712
     assert fold.kind == "NonsmoothFold"
     assert abs(unstable.value.min() - float(fold.value)) < 1e-4 and unstable.value.max() == 1.2
+
+
+def test_a_forced_oscillator_that_is_impossible_at_the_begin_is_named():
+    """The message said that there was no forcing."""
+
+    def between(sigma):
+        belt = jb.Belt(0.5, jb.Coulomb(1.0, 1.0), load=0.25, lower=-sigma, upper=sigma)
+        return jb.Oscillator(0.1, (belt,), forcing=jb.Harmonic(1.0, 0.5))
+
+    for start in (None, (0.0, 0.0)):
+        with pytest.raises(ValueError, match="lower of belt 0 must be < upper"):
+            jb.bifurcation_diagram(between, span=(0.0, 3.0), start=start)

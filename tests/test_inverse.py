@@ -457,3 +457,12 @@ def test_a_contact_edge_below_zero_is_designed():
     found = jb.design(make(-0.2), [(jb.amplitude, wanted)], where=lambda o: o.belts[1].upper)
     assert found.status == Status.OK
     assert float(jb.amplitude(found.cycle)) == pytest.approx(float(wanted), rel=1e-9)
+
+
+def test_a_distance_may_be_infinite():
+    """Of a point that is not found, and wanted so."""
+    osc, where = jb.presets.class_b(0.45, 0.35), lambda o: o.belts[0].velocity
+    distance = jb.distance_to(jb.BeltAtRest(belt=1), where=where)
+    found = jb.design(osc, [(distance, (0.05, np.inf))], where=where)
+    assert found.status == Status.OK and found.iterations == 0
+    assert float(found.achieved[0]) == np.inf

@@ -960,3 +960,28 @@ def test_forces_in_either_order_have_the_same_motions():
     unlike = jb.Oscillator(0.5, (belt,), forcing=(fast, jb.Harmonic(0.5, 1.01)))
     with pytest.raises(ValueError, match="of 64 periods of the slowest at most"):
         jb.find_cycle(unlike, (1.0, 0.0))
+
+
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("load", [0.25, 0.3])
+def test_a_branch_goes_on_where_a_motion_touches_two_boundaries_at_once(load):
+    """From the side on which it sticks to both belts it ended there. Where it slips between them
+    their friction is constant, so the motion is in closed form."""
+
+    def make(frequency):
+        law = jb.Coulomb(1.0, 1.0)
+        belts = jb.Belt(0.5, law, load=0.25), jb.Belt(-0.5, law, load=load)
+        return jb.Oscillator(0.1, belts, forcing=jb.Harmonic(1.0, frequency))
+
+    def too_fast(w):
+        return w / np.hypot(1 - w**2, 0.1 * w) - 0.5
+
+    touches = brentq(too_fast, 0.3, 0.5, xtol=1e-14)
+    for span, start in (((0.4, 0.44), (0.0, 0.0)), ((0.39, 0.43), None)):
+        found = jb.bifurcation_diagram(make, span=span, start=start)
+        assert found.open_ends == () and len(found.branches) == 1
+        (point,) = found.points
+        assert type(point.condition) is jb.GrazingSliding
+        assert float(point.value) == pytest.approx(touches, abs=1e-11)
+        values = found.branches[0].values
+        assert (min(values), max(values)) == pytest.approx(span)

@@ -507,3 +507,31 @@ def test_a_cycle_that_slips_past_the_strobe_repeats_nothing(steepness):
     axes = {"frequency": frequencies}
     found = jb.decoded(jb.sweep(make, axes, y0=(0.9, 0.1), t1=5000.0, observe="attractor"))
     assert list(found.kind.values) == ["undecided"] * 3
+
+
+def label_of(make, value, start):
+    axes = {"damping": [value]}
+    found = jb.sweep(make, axes, y0=tuple(start), t1=3000.0, observe="attractor")
+    return str(jb.decoded(found).kind.values[0]), jb.Status(int(found.status[0]))
+
+
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("edge, amplitude, frequency", [(0.0, 0.5, 1.25), (-np.inf, 0.3, 1.7)])
+def test_what_turns_attracts_by_the_area_that_shrinks(edge, amplitude, frequency):
+    """The belt outruns the mass, and damping alone changes areas; tangents turn, and are shorter
+    now and then. So weak damping attracts, none is neutral, and a negative one leads away."""
+
+    def make(damping):
+        belt = jb.Belt(4.0, jb.Coulomb(1.0, 1.0), load=0.2, lower=edge)
+        return jb.Oscillator(damping, (belt,), forcing=jb.Harmonic(amplitude, frequency))
+
+    start = (-0.79, 0.0) if np.isfinite(edge) else (0.04, 0.0)
+    for damping in (1e-2, 1e-4, 1e-5):
+        motion = jb.periodic(make(damping), start)
+        assert bool(motion.stable)
+        assert label_of(make, damping, motion.start) == ("periodic", Status.OK)
+    start = jb.periodic(make(0.0), start).start
+    assert label_of(make, 0.0, start) == ("undecided", Status.NEUTRAL)
+    for damping in (-1e-5, -1e-3):
+        motion = jb.periodic(make(damping), start)
+        assert label_of(make, damping, motion.start)[0] == "undecided"

@@ -447,3 +447,16 @@ def test_audits_find_repeats_that_are_none(observe, monkeypatch):
 def test_what_cannot_be_audited_is_refused():
     with pytest.raises(ValueError, match="audit must be a share from 0 to 1, got 2"):
         jb.sweep(jb.presets.class_b, AUDITED, t1=1.0, audit=2.0)
+
+
+def test_an_impossible_oscillator_has_no_final_state():
+    """It was the start."""
+
+    def make(frequency):
+        belt = jb.Belt(0.3, jb.Coulomb(1.0, 0.8), load=1.0)
+        return jb.Oscillator(0.1, (belt,), forcing=jb.Harmonic(0.9, frequency))
+
+    found = jb.sweep(make, {"frequency": [1.3, -1.0, np.nan]}, y0=(0.5, 0.0), t1=10.0)
+    assert list(found.status.values[1:]) == [jb.Status.NOT_FINITE] * 2
+    assert np.isfinite(found.x1_end[0]) and np.all(np.isnan(found.x1_end[1:]))
+    assert np.all(np.isnan(found.x2_end[1:]))

@@ -238,7 +238,7 @@ def _is_forced(osc: Any, where: Any, span: Any) -> bool:
     made = [_made_by(osc, end) for end in ends]
     clocks = [has_clock(one) for one in made if one is not None]
     require(len(set(clocks)) < 2, "span", WITH_A_CLOCK, ends)
-    return made[0] is not None and clocks[0]
+    return bool(clocks) and clocks[0]
 
 
 def _made_by(make: Any, value: float) -> Oscillator | None:

@@ -16,6 +16,7 @@ sliding bifurcations; contact edges are in `forced_edges`. What touches begins a
 there, or from an arc beyond that is left out.
 """
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, NamedTuple
@@ -366,8 +367,13 @@ class TimedGrazing(AbstractForcedCondition):
             row = int(np.flatnonzero(rows.ends == names.tangent + k)[0])
             yield Beginning(rows, 0.0, system(row))
             return
-        short = [row for row in range(1, len(rows.ends) - 1) if self._may_end(rows, row)]
-        for shorter, row, value in without_one_of(rows, short, names.tangent + k):
+        inner = range(1, len(rows.ends) - 1)
+        short, *others = (
+            [row for row in inner if self._may_end(rows, row, belt)]
+            for belt in (k, *(i for i in range(len(osc.belts)) if i != k))
+        )
+        others = [row for row in itertools.chain(*others) if row not in short]
+        for shorter, row, value in without_one_of(rows, short, names.tangent + k, others):
             yield Beginning(shorter, value, system(row))
         for row, since, state, value in minima_of_guards(osc, motion, slice(k, k + 1)):
             if abs(rows.codes[row, k]) == 1:
@@ -389,17 +395,18 @@ class TimedGrazing(AbstractForcedCondition):
         speed = abs(float(slopes[self.belt]))
         return speed if -float(excess) > speed + SMALLEST_JUMP else None
 
-    def _may_end(self, rows: ArcRows, row: int) -> bool:
-        """Whether an arc is a stick phase to the belt, or to more belts of its velocity, from which
+    @staticmethod
+    def _may_end(rows: ArcRows, row: int, belt: int) -> bool:
+        """Whether an arc is a stick phase to a belt, or to more belts of its velocity, from which
         the slip before goes on."""
         codes = rows.codes[row - 1 : row + 2]
-        before, here, after = codes[:, self.belt]
-        differ = codes[:, np.any(codes != codes[:, [self.belt]], axis=0)]
+        before, here, after = codes[:, belt]
+        differ = codes[:, np.any(codes != codes[:, [belt]], axis=0)]
         alone = (
             here == STUCK and before == after and abs(before) == 1 and not np.ptp(differ, 0).any()
         )
         onset = Ends(rows.codes.shape[1]).onset
-        return bool(alone and rows.ends[row - 1] == self.belt and rows.ends[row] == onset)
+        return bool(alone and rows.ends[row - 1] == belt and rows.ends[row] == onset)
 
 
 class _AtArrival(AbstractForcedCondition):
@@ -549,13 +556,14 @@ def friction_jumps(osc: Oscillator, belt: int) -> bool:
 
 
 def without_one_of(
-    rows: ArcRows, short: list[int], end: int
+    rows: ArcRows, short: list[int], end: int, others: Sequence[int] = ()
 ) -> Iterator[tuple[ArcRows, int, float]]:
     """The arcs without one of some that may end, cut there by an end; the row that is cut;
     and the square of the duration that is left out.
 
     Arcs of one duration are left out together first: those of a symmetric motion end at once, and
-    one touches only where the others do.
+    one touches only where the others do. others: arcs of other kinds that may vanish at once with
+    these, of whatever duration, as those of two belts do where a motion touches both boundaries.
     """
     for row in short:
         duration, alike = rows.z[row, 3], [row]
@@ -564,12 +572,14 @@ def without_one_of(
             beside = any(abs(i - k) < 2 for k in alike)
             if not beside and abs(rows.z[i, 3] - duration) < ALIKE_ARCS * duration:
                 alike.append(i)
-        alike.sort()
-        for some in [alike, [row]] if len(alike) > 1 else [[row]]:
+        near = [i for i in others if rows.z[i, 3] < 1 / ALIKE_ARCS * duration]
+        near = [i for i in near if not any(abs(i - k) < 2 for k in alike)]
+        some = [[*alike, *near], alike, [row]]
+        for gone in [one for i, one in enumerate(some) if one not in some[:i]]:
             shorter = rows
-            for i in reversed(some):
+            for i in sorted(gone, reverse=True):
                 shorter = shorter.without(i, end if i == row else None)
-            yield shorter, row - 1 - 2 * sum(i < row for i in some), float(duration) ** 2
+            yield shorter, row - 1 - 2 * sum(i < row for i in gone), float(duration) ** 2
 
 
 def minima_of_guards(osc: Oscillator, motion: PeriodicMotion, some: slice) -> Iterator[tuple]:

@@ -232,7 +232,9 @@ def design(
         # Where nothing is achieved a single value is wanted all the same.
         single = np.where(np.ptp(intervals, axis=1) == 0, intervals[:, 0], np.nan)
         wanted = np.where(np.isnan(achieved), single, np.clip(achieved, *intervals.T))
-        return (achieved - wanted) / sizes, wanted
+        # A distance may be infinite, and wanted so.
+        away = np.subtract(achieved, wanted, where=achieved != wanted, out=np.zeros(len(sizes)))
+        return away / sizes, wanted
 
     def improved(slopes, miss, damping):
         matrix = np.nan_to_num(np.where(miss[:, None] != 0, slopes / sizes[:, None], 0.0))

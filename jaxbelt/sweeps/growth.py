@@ -37,7 +37,8 @@ UNMEASURED = 0.25
 class Growth(eqx.Module):
     """The tangent and the logarithms of its growth, arrays [lanes].
 
-    d1, d2: the tangent, of size one when it was last looked at; log: its growth by then; since,
+    d1, d2: the tangent, of size one when it was last looked at; e1, e2: a second one, on the same
+    scale; log: the growth of the first by then; since,
     before: the time at which the present block began, and `log` there; began: the time at which the
     run did; blocks: how many are done, -1 before the first; total, squares: sums of the rates of
     growth in them, and of their squares; sticks: whether the mass stuck since the first began.
@@ -45,6 +46,8 @@ class Growth(eqx.Module):
 
     d1: Array
     d2: Array
+    e1: Array
+    e2: Array
     log: Array
     since: Array
     before: Array
@@ -60,6 +63,8 @@ class Growth(eqx.Module):
         return cls(
             d1=zero + np.cos(1.0),
             d2=zero + np.sin(1.0),
+            e1=zero - np.sin(1.0),
+            e2=zero + np.cos(1.0),
             log=zero,
             since=lanes.t,
             before=zero,
@@ -74,6 +79,25 @@ class Growth(eqx.Module):
     def size(self) -> Array:
         """The logarithm of the tangent's growth until now; -inf where it has vanished."""
         return self.log + jnp.log(jnp.hypot(self.d1, self.d2))
+
+    def with_frame(self, flags: Array) -> "Growth":
+        """With a second tangent that is normal to the first, where a flag is."""
+        return replace(
+            self, e1=jnp.where(flags, -self.d2, self.e1), e2=jnp.where(flags, self.d1, self.e2)
+        )
+
+    def multiplier_since(self, d1: Array, d2: Array, log: Array) -> tuple[Array, Array]:
+        """The logarithm of the larger multiplier, in size, of the map of tangents since a frame was
+        begun, and whether both are complex.
+
+        d1, d2: the first tangent then, of size one; log: the `size` of its growth.
+        """
+        scale = jnp.exp(self.log - log)
+        trace = scale * (d1 * self.d1 + d2 * self.d2 - d2 * self.e1 + d1 * self.e2)
+        area = scale * scale * (self.d1 * self.e2 - self.d2 * self.e1)
+        inner = 0.25 * trace * trace - area
+        real = 0.5 * jnp.abs(trace) + jnp.sqrt(jnp.maximum(inner, 0.0))
+        return jnp.where(inner < 0, 0.5 * jnp.log(jnp.abs(area)), jnp.log(real)), inner < 0
 
     def exponent(self) -> tuple[Array, Array]:
         """The largest exponent per unit of time, and its standard error; NaN without blocks."""
@@ -120,7 +144,8 @@ class LargestExponent(Observer):
 def grown(osc, growth: Growth, lanes: Lanes, course: Course, h: Array, ones) -> Growth:
     """The tangent after a step of size h; along a slip arc the trace of the field is taken into the
     logarithm."""
-    mode, d1, d2, log = lanes.mode, growth.d1, growth.d2, growth.log
+    mode, log = lanes.mode, growth.log
+    tangents = (growth.d1, growth.d2), (growth.e1, growth.e2)
     along = jnp.where(mode.any_stuck, 0.0, h)
     rates = []
     for k in range(5):
@@ -142,14 +167,18 @@ def grown(osc, growth: Growth, lanes: Lanes, course: Course, h: Array, ones) -> 
         for k in reversed(range(1, 9)):
             even = 1 + square * even / ((2 * k - 1) * (2 * k))
             odd = 1 + square * odd / (2 * k * (2 * k + 1))
-        d1, d2 = even * d1 + odd * (p * d1 + q * d2), even * d2 + odd * (r * d1 - p * d2)
+        tangents = [
+            (even * a + odd * (p * a + q * b), even * b + odd * (r * a - p * b))
+            for a, b in tangents
+        ]
         log = log + 0.5 * half * mean
-    return replace(growth, d1=materialise(d1, ones), d2=materialise(d2, ones), log=log)
+    (d1, d2), (e1, e2) = ((materialise(a, ones), materialise(b, ones)) for a, b in tangents)
+    return replace(growth, d1=d1, d2=d2, e1=e1, e2=e2, log=log)
 
 
 def grown_past(osc, growth: Growth, lanes: Lanes, passage: Passage, t1: Array) -> Growth:
-    """The tangent behind the events that were passed, and its growth until now."""
-    n, tangent = len(osc.belts), (growth.d1, growth.d2)
+    """The tangents behind the events that were passed, and their growth until now."""
+    n, tangents = len(osc.belts), (growth.d1, growth.d2, growth.e1, growth.e2)
     busy = lanes.run >= 0
     fired, released = passage.fired & busy, passage.released & busy
 
@@ -161,10 +190,10 @@ def grown_past(osc, growth: Growth, lanes: Lanes, passage: Passage, t1: Array) -
         number = jnp.where(upward, 3 * n + 1, 3 * n)
         return select(released, of_lanes(_saltation, osc, passage.mode, mode, number, state, d), d)
 
-    args = passage, (lanes.x1, lanes.x2, lanes.t), lanes.mode, fired, released, tangent
-    d1, d2 = in_few(fired | released, jumped, (osc, *args), tangent)
+    args = passage, (lanes.x1, lanes.x2, lanes.t), lanes.mode, fired, released, tangents
+    d1, d2, e1, e2 = in_few(fired | released, jumped, (osc, *args), tangents)
     sticks = growth.sticks | passage.mode.any_stuck | lanes.mode.any_stuck
-    growth = replace(growth, d1=d1, d2=d2, sticks=sticks)
+    growth = replace(growth, d1=d1, d2=d2, e1=e1, e2=e2, sticks=sticks)
     return _counted(growth, lanes.t, t1)
 
 
@@ -183,6 +212,8 @@ def _counted(growth: Growth, t: Array, t1: Array) -> Growth:
         growth,
         d1=growth.d1 / size,
         d2=growth.d2 / size,
+        e1=growth.e1 / size,
+        e2=growth.e2 / size,
         log=log,
         since=jnp.where(over, t, growth.since),
         before=jnp.where(over, log, growth.before),
@@ -195,13 +226,16 @@ def _counted(growth: Growth, t: Array, t1: Array) -> Growth:
     )
 
 
-def _saltation(osc: OwnOscillator, before: Mode, after: Mode, number: Array, y, d):
-    """The tangent behind an event, of scalars: the guard of that number fired at the state y."""
+def _saltation(osc: OwnOscillator, before: Mode, after: Mode, number: Array, y, tangents):
+    """Two tangents behind an event, of scalars: the guard of that number fired at the state y."""
     entry, exit_ = field_at(osc, before, y), field_at(osc, after, y)
-    late = delay_of_event(osc, before, number, y, d)
-    d1 = d[0] + (entry[0] - exit_[0]) * late
-    d2 = d[1] + (entry[1] - exit_[1]) * late
-    return d1, jnp.where(after.any_stuck, 0.0, d2)
+    behind = []
+    for d in (tangents[:2], tangents[2:]):
+        late = delay_of_event(osc, before, number, y, d)
+        d1 = d[0] + (entry[0] - exit_[0]) * late
+        d2 = d[1] + (entry[1] - exit_[1]) * late
+        behind += [d1, jnp.where(after.any_stuck, 0.0, d2)]
+    return tuple(behind)
 
 
 def delay_of_event(osc: OwnOscillator, before: Mode, number: Array, y, d) -> Array:

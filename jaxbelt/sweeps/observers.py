@@ -14,6 +14,7 @@ from ..kernel.lanes import Observer, Variable, choose
 from ..kernel.marks import Mark
 from ..model.oscillator import has_clock
 from ..model.own_units import OwnOscillator, in_units_of_user
+from ..results import Status
 
 #: Meanings of contact codes.
 CONTACTS = {
@@ -58,9 +59,10 @@ class Final(Observer):
         return replace(lanes, t=mark.behind(lanes, loops), events=events, memory=renewed)
 
     def finish(self, osc, lanes):
+        known = jnp.where(lanes.status == Status.NOT_FINITE.value, jnp.nan, 1.0)
         return {
-            "x1_end": lanes.x1,
-            "x2_end": lanes.x2,
+            "x1_end": known * lanes.x1,
+            "x2_end": known * lanes.x2,
             "mode_end": lanes.mode.codes,
             "n_events": lanes.events,
             "status": lanes.status,

@@ -66,8 +66,9 @@ STEADY, STEADY_CHAOS = 0.01, 0.2
 #: motion that grew as much would be seen to grow.
 GROWTH_OF_CHAOS = 10.0
 #: Growth of a tangent, its logarithm, that is rounding; its error in a unit of time, which hardly
-#: depends on the tolerance: 4e-6 were seen with steep laws of friction, 1e-9 with Coulomb's.
-STILL, ERRORS_OF_GROWTH = 1e-9, 1e-5
+#: depends on the tolerance: 4e-6 were seen with steep laws of friction, 1e-9 with Coulomb's. For
+#: complex multipliers areas tell it, in which errors are smaller.
+STILL, ERRORS_OF_GROWTH, ERRORS_OF_AREAS = 1e-9, 1e-5, 1e-7
 #: Shares of the time that the mass does not stick, and differences of states, that are rounding.
 CARRIED, STANDS_STILL = 1e-9, 1e-13
 #: An extremum is known from a point that is this near in time; steps are cut until there is one.
@@ -82,7 +83,7 @@ class _Repeats(eqx.Module):
     x1, x2: the state that later ones are compared with, of the strobe `at`; patience: strobes until
     it is given up; n: strobes after which the motion seems to repeat, 0: not yet; confirmed:
     strobes over which it has; asked: how many these were when half of them were over, 0: before;
-    log: of the tangent's growth when these began, or at their half; moved: how far the last repeat
+    log, d1, d2: growth and direction of the tangent at their half; moved: how far the last repeat
     was from its own; nearest: the smallest distance of another strobe.
     """
 
@@ -94,6 +95,8 @@ class _Repeats(eqx.Module):
     confirmed: Array
     asked: Array
     log: Array
+    d1: Array
+    d2: Array
     moved: Array
     nearest: Array
 
@@ -187,7 +190,10 @@ class ForcedAttractor(Observer):
         nowhere, never = zero + jnp.nan, jnp.full_like(count, -1)
         patience = count + FIRST_PATIENCE
         far = zero + jnp.inf
-        repeats = _Repeats(nowhere, nowhere, never, patience, count, count, count, zero, zero, far)
+        tangent = zero, zero, zero
+        repeats = _Repeats(
+            nowhere, nowhere, never, patience, count, count, count, *tangent, zero, far
+        )
         winding = Winding.none(lanes)
         return _RunSoFar(
             strobes=(passed + 1).astype(count.dtype),
@@ -319,16 +325,17 @@ class ForcedAttractor(Observer):
         # Nothing pulls a motion to one that lies beside others which repeat as well, and one from
         # which a tangent leads away is no attractor. A tangent may be lost in a stick phase on the
         # way, once; so its growth is asked for since half of these strobes.
-        vanished = seen.growth.size == -jnp.inf
-        gained = jnp.where(vanished, -jnp.inf, seen.growth.size - known.log)
+        growth = seen.growth
+        vanished = growth.size == -jnp.inf
+        gained, turns = growth.multiplier_since(known.d1, known.d2, known.log)
+        gained = jnp.where(vanished, -jnp.inf, gained)
         asked_for = (confirmed - known.asked).astype(x1.dtype) * _strobe_period(osc, seen.turns)
-        doubt = STILL + ERRORS_OF_GROWTH * asked_for
-        found = found & (gained < doubt)
-        shrunk = gained < -doubt
+        doubt = STILL + jnp.where(turns, ERRORS_OF_AREAS, ERRORS_OF_GROWTH) * asked_for
         asks = again & (known.asked == 0) & (2 * confirmed >= least) & ~vanished
-        waits = ~shrunk & (confirmed < 2 * known.asked)
-        kind = jnp.where(shrunk, PERIODIC, FORCED_CONTINUUM)
-        found = found & ~asks & ~waits
+        found = found & ~asks & (gained < doubt) & ((known.asked > 0) | vanished)
+        kind = jnp.where(gained < -doubt, PERIODIC, FORCED_CONTINUUM)
+        begins = due & asks
+        length = jnp.hypot(growth.d1, growth.d2)
         asked = jnp.where(asks, confirmed, jnp.where(fresh & ~again, 0, known.asked))
         repeats = _Repeats(
             x1=jnp.where(fresh, x1, known.x1),
@@ -338,7 +345,9 @@ class ForcedAttractor(Observer):
             n=n.astype(known.n.dtype),
             confirmed=confirmed.astype(known.n.dtype),
             asked=asked.astype(known.n.dtype),
-            log=jnp.where(fresh & ~again | asks, seen.growth.size, known.log),
+            log=jnp.where(asks, growth.size, known.log),
+            d1=jnp.where(asks, growth.d1 / length, known.d1),
+            d2=jnp.where(asks, growth.d2 / length, known.d2),
             moved=jnp.where(again | sooner, away, jnp.where(fresh, jnp.inf, known.moved)),
             nearest=jnp.where(fresh, jnp.inf, nearest),
         )
@@ -351,6 +360,7 @@ class ForcedAttractor(Observer):
             seen,
             strobes=jnp.where(due, now + 1, now).astype(now.dtype),
             repeats=choose(due, repeats, known),
+            growth=growth.with_frame(begins),
             extent=choose(due, kept, seen.extent),
             loop_events=jnp.where(found, lanes.events - extent.events, seen.loop_events),
             loop_rises=jnp.where(found, rises - extent.rises, seen.loop_rises),
