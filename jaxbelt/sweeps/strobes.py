@@ -156,7 +156,7 @@ class ForcedAttractor(Observer):
 
     - A periodic motion: its states at strobes repeat, all of them, over `CONFIRMED` strobes and two
       of its periods; no state in between is the same; what is left of the approach, by the rate at
-      which it shrinks, is below `SAME` of its size; and a tangent shrinks in their second half.
+      which it shrinks, is below `SAME` of its size; and multipliers show that it attracts.
     - None of these: one of a continuum of motions, where a tangent keeps its size while the motion
       repeats, or always. It attracts nothing, and the run ends undecided with the status NEUTRAL.
     - Stuck for ever, or at rest on an edge that pushes back from both sides at all times.
