@@ -222,8 +222,8 @@ def test_one_unit_of_a_frequency_or_phase_shifts_a_wave_by_a_radian():
     selection, u = selection_of(osc, where, None, 60.0)
     np.testing.assert_allclose(selection.values(jnp.asarray(u)), TRUTH, rtol=1e-14)
     slopes = jnp.diag(jax.jacfwd(selection.values)(jnp.asarray(u)))
-    # The others as without a clock: of their own size.
-    np.testing.assert_allclose(slopes, [1.0, 0.1, 0.9, 1 / 60, 1.0], rtol=1e-12)
+    # The others as without a clock: of their own size, or of the distance to their bound.
+    np.testing.assert_allclose(slopes, [1.0 - KINETIC, 0.1, 0.9, 1 / 60, 1.0], rtol=1e-12)
     assert plain.stretch is None
     zero = oscillator(TRUTH * [1, 1, 1, 1, 0])
     selection, u = selection_of(zero, where, None, 60.0)
