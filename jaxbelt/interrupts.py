@@ -11,16 +11,18 @@ from typing import Any
 class _Handler:
     """A handler of interrupts that notes them, and raises them if so wished.
 
-    Not during an import, which may be left half done, or end the process.
+    Not during an import, which may be left half done, or end the process; but in one that was under
+    way when the handler was made, for whole programs may be run by an import.
     """
 
     def __init__(self, came: threading.Event, at_once: bool):
         self.came = came
         self.at_once = at_once
+        self.imports = _imports(sys._getframe())
 
     def __call__(self, number: int, frame: Any) -> None:
         self.came.set()
-        if self.at_once and not _imports(frame):
+        if self.at_once and _imports(frame) <= self.imports:
             signal.default_int_handler(number, frame)
 
     def raise_noted(self) -> None:
@@ -28,13 +30,13 @@ class _Handler:
             raise KeyboardInterrupt
 
 
-def _imports(frame: Any) -> bool:
-    """Whether a frame is that of an import, or is called by one."""
+def _imports(frame: Any) -> int:
+    """The number of frames of imports among a frame and those that it was called by."""
+    count = 0
     while frame is not None:
-        if frame.f_code.co_filename.startswith("<frozen importlib"):
-            return True
+        count += frame.f_code.co_filename.startswith("<frozen importlib")
         frame = frame.f_back
-    return False
+    return count
 
 
 @contextmanager

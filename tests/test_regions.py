@@ -92,9 +92,11 @@ def test_curves_are_found_where_no_line_meets_them(corner_of_map):
     cells = motions_in_cells(
         in_one_unit(make), told.names, np.column_stack([axis.ravel() for axis in grid])
     )
-    pairs = neighbours_that_differ(cells.motions.reshape(grid[0].shape), told.on_line)
-    bounds.curves = list(told.curves)
-    assert len(pairs) and np.all(bounds.away(pairs) < 0.5)
+    motions = cells.motions.reshape(grid[0].shape)
+    pairs = neighbours_that_differ(motions, told.on_line)
+    missing = int(np.sum(bounds.away(pairs) > 0.5))
+    assert bounds.search_between(motions, told.on_line) == ()
+    assert missing > 0 and np.all(bounds.away(pairs) < 0.5)
 
 
 @pytest.mark.slow

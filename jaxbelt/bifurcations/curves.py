@@ -40,6 +40,7 @@ from .forced import AbstractForcedCondition, UnitCircle
 from .forced_ends import border_at, meeting_point
 from .special import (
     CREEPS,
+    FAR,
     SpecialPoint,
     Trail,
     is_elsewhere,
@@ -407,7 +408,8 @@ def _begun_again(
     point = problem.condition.named_point_beside(along, float(values[1 - held]), *known)
     if point is None or point.condition.lineage != problem.condition.lineage:
         return None
-    if abs(float(point.value) - values[1 - held]) > SAME_POINT_AGAIN:
+    away = abs(float(point.value) - values[1 - held])
+    if away > SAME_POINT_AGAIN or is_elsewhere(point.place, track.place(at.u), FAR):
         return None
     new, u = Track.begun(problem.variation, point, values)
     direction = new.tangent(u)

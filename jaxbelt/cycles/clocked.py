@@ -58,6 +58,7 @@ from .shooting import (
     jacobian,
     over_mesh,
     slip_slopes,
+    trace_of,
     with_columns,
 )
 
@@ -288,22 +289,8 @@ def logs_of_areas(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
     """
 
     def one(osc, codes, end, mesh, after, unknown):
-        mode, n = mode_of(codes), len(osc.belts)
-
-        def field(y):
-            now = at_time(osc, y[2])
-
-            def acceleration(x2):
-                return mode_acceleration(now, mode, y[0], x2)
-
-            _, divergence = jax.jvp(acceleration, (y[1],), (jnp.ones_like(y[1]),))
-            return jnp.append(slip_slopes(osc, codes, y[:3]), divergence)
-
-        def advance(y, fraction):
-            return arc_step(field, y, unknown[3] * fraction, FINE)
-
-        begun = jnp.append(unknown[:3], 0.0)
-        last, _ = over_mesh(advance, begun, jnp.where(mode.any_stuck, 0.0, mesh))
+        n = len(osc.belts)
+        last = flow(osc, codes, mesh, unknown[:3], unknown[3], trace_of)
         state = last[0], last[1], last[2]
 
         def distances(*y):
@@ -311,8 +298,8 @@ def logs_of_areas(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
             return jnp.stack([belt.velocity - osc.omega * y[1] for belt in now.belts])
 
         before, behind = (
-            jax.jvp(distances, state, field_at(osc, one, state))[1]
-            for one in (mode, mode_of(after))
+            jax.jvp(distances, state, field_at(osc, mode_of(one), state))[1]
+            for one in (codes, after)
         )
         at = jnp.arange(n) == end
         ratio = jnp.sum(jnp.where(at, behind, 0.0)) / jnp.sum(jnp.where(at, before, 0.0))

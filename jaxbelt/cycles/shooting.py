@@ -227,17 +227,20 @@ def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, 
     """End of one arc, (x1, x2), and the integrals of `extra(osc, mode, x1, x2)`, a vector, over it.
 
     A stick arc is a straight line; Simpson's rule is exact there for what is at most cubic. With a
-    clock states are (x1, x2, t), and there is no extra.
+    clock states are (x1, x2, t), and the integrals are those of slip arcs, 0 of stick arcs.
     """
     mode = mode_of(codes)
     stuck = mode.any_stuck
-    n_extra = 0 if extra is None else extra(osc, mode, y[0], y[1]).size
+
+    def rates(state):
+        now = at_time(osc, state[2]) if has_clock(osc) else osc
+        return jnp.zeros(0) if extra is None else extra(now, mode, state[0], state[1])
 
     def field(state):
         smooth = slip_slopes(osc, codes, state[: y.size])
-        if extra is None:
-            return smooth
-        return jnp.concatenate([smooth, extra(osc, mode, state[0], state[1])])
+        return smooth if extra is None else jnp.concatenate([smooth, rates(state)])
+
+    n_extra = rates(y).size
 
     start = jnp.concatenate([y, jnp.zeros(n_extra)])
     slip_time = jnp.where(stuck, 0.0, duration)
@@ -248,7 +251,7 @@ def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, 
     slipped, _ = over_mesh(advance, start, mesh)
     if has_clock(osc):
         stuck_end = jnp.stack(carried(osc, mode, (y[0], y[1], y[2]), duration))
-        return jnp.where(stuck, stuck_end, slipped)
+        return jnp.where(stuck, jnp.append(stuck_end, jnp.zeros(n_extra)), slipped)
     v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
     stuck_end = jnp.stack([y[0] + v * duration, v])
     if extra is not None:

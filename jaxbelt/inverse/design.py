@@ -228,12 +228,15 @@ def design(
     def start_of(cycle):
         return cycle.start if isinstance(cycle, PeriodicMotion) else y0
 
-    def off(achieved):
+    def wanted_near(achieved):
         # Where nothing is achieved a single value is wanted all the same.
         single = np.where(np.ptp(intervals, axis=1) == 0, intervals[:, 0], np.nan)
-        wanted = np.where(np.isnan(achieved), single, np.clip(achieved, *intervals.T))
+        return np.where(np.isnan(achieved), single, np.clip(achieved, *intervals.T))
+
+    def off(achieved):
         # A distance may be infinite, and wanted so.
-        away = np.subtract(achieved, wanted, where=achieved != wanted, out=np.zeros(len(sizes)))
+        wanted, away = wanted_near(achieved), np.zeros(len(sizes))
+        np.subtract(achieved, wanted, where=achieved != wanted, out=away)
         return away / sizes, wanted
 
     def improved(slopes, miss, damping):
@@ -246,8 +249,7 @@ def design(
 
     achieved, slopes, cycle = evaluate(u, y0)
     # The unit of a miss; of an interval its nearer end counts.
-    sizes = np.ones(len(intervals))
-    known = np.stack([np.asarray(achieved), off(np.asarray(achieved))[1]])
+    known = np.stack([np.asarray(achieved), wanted_near(np.asarray(achieved))])
     largest = np.max(np.abs(np.where(np.isfinite(known), known, 0.0)), axis=0)
     sizes = np.where(largest > 0, largest, 1.0)
     miss, wanted = off(np.asarray(achieved))

@@ -276,8 +276,8 @@ def fit(
             some tens of data.
         bounds: For each parameter (lower, upper) or None; None keeps it where the oscillator is
             possible: what cannot be negative positive, a contact edge on its side of the other one
-            if that is not selected, too. Parameters stay inside by a change of
-            variables, so an estimate at a bound is one that would be outside without it.
+            if that is not selected, too. Parameters stay inside by a change of variables, so an
+            estimate at a bound is one that would be outside without it.
         starts: Number of starts of the search, spread about the guess.
         report: Function that is called with lines on the progress, such as `print`.
 

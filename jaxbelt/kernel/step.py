@@ -15,8 +15,8 @@ computes everything that it deems cheap again in each place where it is used; a 
 
 Derivatives are forward mode (see `derivatives.in_directions`): step sizes carry none, the landing's
 Taylor step gives event times and states their exact ones, and so does the last step, t1 - t. Near
-rest any step will do for the state, but not for them. So where derivatives are wanted, a step also
-has to keep the tolerance for a motion of size one in the linearised field.
+rest any step will do for the state, but not for its derivatives. So where these are wanted, a step
+also has to keep the tolerance for a motion of size one in the linearised field.
 """
 
 import functools

@@ -21,7 +21,7 @@ from jaxtyping import Array
 
 from ..cycles.exponents import BLOCKS
 from ..kernel.clocked import of_lanes, rate_of_stick
-from ..kernel.lanes import Lanes, Observer, Passage, Variable, in_few, materialise
+from ..kernel.lanes import Lanes, Observer, Passage, Variable, choose, in_few, materialise
 from ..model.instants import field_at, guards_at
 from ..model.modes import Mode, any_of, mode_acceleration, select
 from ..model.oscillator import at_time
@@ -30,6 +30,8 @@ from ..numerics.implicit import step_to_root
 from ..results import Status
 from .moments import Course
 
+#: Tangents, (d1, d2) each.
+Tangents = tuple[tuple[Array, Array], ...]
 #: Share of a run before its exponent is measured.
 UNMEASURED = 0.25
 
@@ -37,8 +39,8 @@ UNMEASURED = 0.25
 class Growth(eqx.Module):
     """The tangent and the logarithms of its growth, arrays [lanes].
 
-    d1, d2: the tangent, of size one when it was last looked at; e1, e2: a second one, on the same
-    scale; log: the growth of the first by then; since,
+    d1, d2: the tangent, of size one when it was last looked at; second: another one on the same
+    scale, (d1, d2), or None; log: the growth of the first by then; since,
     before: the time at which the present block began, and `log` there; began: the time at which the
     run did; blocks: how many are done, -1 before the first; total, squares: sums of the rates of
     growth in them, and of their squares; sticks: whether the mass stuck since the first began.
@@ -46,8 +48,7 @@ class Growth(eqx.Module):
 
     d1: Array
     d2: Array
-    e1: Array
-    e2: Array
+    second: tuple[Array, Array] | None
     log: Array
     since: Array
     before: Array
@@ -58,13 +59,12 @@ class Growth(eqx.Module):
     sticks: Array
 
     @classmethod
-    def none(cls, lanes: Lanes) -> "Growth":
+    def none(cls, lanes: Lanes, *, has_second: bool = False) -> "Growth":
         zero = jnp.zeros_like(lanes.t)
         return cls(
             d1=zero + np.cos(1.0),
             d2=zero + np.sin(1.0),
-            e1=zero - np.sin(1.0),
-            e2=zero + np.cos(1.0),
+            second=(zero - np.sin(1.0), zero + np.cos(1.0)) if has_second else None,
             log=zero,
             since=lanes.t,
             before=zero,
@@ -80,21 +80,28 @@ class Growth(eqx.Module):
         """The logarithm of the tangent's growth until now; -inf where it has vanished."""
         return self.log + jnp.log(jnp.hypot(self.d1, self.d2))
 
-    def with_frame(self, flags: Array) -> "Growth":
+    @property
+    def tangents(self) -> Tangents:
+        return ((self.d1, self.d2), *(() if self.second is None else (self.second,)))
+
+    def with_tangents(self, tangents: Tangents) -> "Growth":
+        (d1, d2), *others = tangents
+        return replace(self, d1=d1, d2=d2, second=others[0] if others else None)
+
+    def with_normal(self, flags: Array) -> "Growth":
         """With a second tangent that is normal to the first, where a flag is."""
-        return replace(
-            self, e1=jnp.where(flags, -self.d2, self.e1), e2=jnp.where(flags, self.d1, self.e2)
-        )
+        return replace(self, second=choose(flags, (-self.d2, self.d1), self.second))
 
     def multiplier_since(self, d1: Array, d2: Array, log: Array) -> tuple[Array, Array]:
-        """The logarithm of the larger multiplier, in size, of the map of tangents since a frame was
-        begun, and whether both are complex.
+        """The logarithm of the size of the larger multiplier of the map of tangents, since the
+        second one was normal to the first, and whether both multipliers are complex.
 
         d1, d2: the first tangent then, of size one; log: the `size` of its growth.
         """
+        first, second = self.tangents
         scale = jnp.exp(self.log - log)
-        trace = scale * (d1 * self.d1 + d2 * self.d2 - d2 * self.e1 + d1 * self.e2)
-        area = scale * scale * (self.d1 * self.e2 - self.d2 * self.e1)
+        trace = scale * (d1 * first[0] + d2 * first[1] - d2 * second[0] + d1 * second[1])
+        area = scale * scale * (first[0] * second[1] - first[1] * second[0])
         inner = 0.25 * trace * trace - area
         real = 0.5 * jnp.abs(trace) + jnp.sqrt(jnp.maximum(inner, 0.0))
         return jnp.where(inner < 0, 0.5 * jnp.log(jnp.abs(area)), jnp.log(real)), inner < 0
@@ -144,8 +151,7 @@ class LargestExponent(Observer):
 def grown(osc, growth: Growth, lanes: Lanes, course: Course, h: Array, ones) -> Growth:
     """The tangent after a step of size h; along a slip arc the trace of the field is taken into the
     logarithm."""
-    mode, log = lanes.mode, growth.log
-    tangents = (growth.d1, growth.d2), (growth.e1, growth.e2)
+    mode, tangents, log = lanes.mode, growth.tangents, growth.log
     along = jnp.where(mode.any_stuck, 0.0, h)
     rates = []
     for k in range(5):
@@ -167,18 +173,18 @@ def grown(osc, growth: Growth, lanes: Lanes, course: Course, h: Array, ones) -> 
         for k in reversed(range(1, 9)):
             even = 1 + square * even / ((2 * k - 1) * (2 * k))
             odd = 1 + square * odd / (2 * k * (2 * k + 1))
-        tangents = [
+        tangents = tuple(
             (even * a + odd * (p * a + q * b), even * b + odd * (r * a - p * b))
             for a, b in tangents
-        ]
+        )
         log = log + 0.5 * half * mean
-    (d1, d2), (e1, e2) = ((materialise(a, ones), materialise(b, ones)) for a, b in tangents)
-    return replace(growth, d1=d1, d2=d2, e1=e1, e2=e2, log=log)
+    tangents = tuple((materialise(a, ones), materialise(b, ones)) for a, b in tangents)
+    return replace(growth.with_tangents(tangents), log=log)
 
 
 def grown_past(osc, growth: Growth, lanes: Lanes, passage: Passage, t1: Array) -> Growth:
     """The tangents behind the events that were passed, and their growth until now."""
-    n, tangents = len(osc.belts), (growth.d1, growth.d2, growth.e1, growth.e2)
+    n, tangents = len(osc.belts), growth.tangents
     busy = lanes.run >= 0
     fired, released = passage.fired & busy, passage.released & busy
 
@@ -191,10 +197,9 @@ def grown_past(osc, growth: Growth, lanes: Lanes, passage: Passage, t1: Array) -
         return select(released, of_lanes(_saltation, osc, passage.mode, mode, number, state, d), d)
 
     args = passage, (lanes.x1, lanes.x2, lanes.t), lanes.mode, fired, released, tangents
-    d1, d2, e1, e2 = in_few(fired | released, jumped, (osc, *args), tangents)
+    tangents = in_few(fired | released, jumped, (osc, *args), tangents)
     sticks = growth.sticks | passage.mode.any_stuck | lanes.mode.any_stuck
-    growth = replace(growth, d1=d1, d2=d2, e1=e1, e2=e2, sticks=sticks)
-    return _counted(growth, lanes.t, t1)
+    return _counted(replace(growth.with_tangents(tangents), sticks=sticks), lanes.t, t1)
 
 
 def _counted(growth: Growth, t: Array, t1: Array) -> Growth:
@@ -209,11 +214,7 @@ def _counted(growth: Growth, t: Array, t1: Array) -> Growth:
     counts = over & (growth.blocks >= 0) & (elapsed > 0)
     rate = jnp.where(counts, (log - growth.before) / jnp.where(counts, elapsed, 1.0), 0.0)
     return replace(
-        growth,
-        d1=growth.d1 / size,
-        d2=growth.d2 / size,
-        e1=growth.e1 / size,
-        e2=growth.e2 / size,
+        growth.with_tangents(tuple((a / size, b / size) for a, b in growth.tangents)),
         log=log,
         since=jnp.where(over, t, growth.since),
         before=jnp.where(over, log, growth.before),
@@ -226,16 +227,19 @@ def _counted(growth: Growth, t: Array, t1: Array) -> Growth:
     )
 
 
-def _saltation(osc: OwnOscillator, before: Mode, after: Mode, number: Array, y, tangents):
-    """Two tangents behind an event, of scalars: the guard of that number fired at the state y."""
+def _saltation(
+    osc: OwnOscillator, before: Mode, after: Mode, number: Array, y, tangents: Tangents
+) -> Tangents:
+    """Tangents behind an event, of scalars: the guard of that number fired at the state y."""
     entry, exit_ = field_at(osc, before, y), field_at(osc, after, y)
-    behind = []
-    for d in (tangents[:2], tangents[2:]):
+
+    def behind(d):
         late = delay_of_event(osc, before, number, y, d)
         d1 = d[0] + (entry[0] - exit_[0]) * late
         d2 = d[1] + (entry[1] - exit_[1]) * late
-        behind += [d1, jnp.where(after.any_stuck, 0.0, d2)]
-    return tuple(behind)
+        return d1, jnp.where(after.any_stuck, 0.0, d2)
+
+    return tuple(behind(d) for d in tangents)
 
 
 def delay_of_event(osc: OwnOscillator, before: Mode, number: Array, y, d) -> Array:

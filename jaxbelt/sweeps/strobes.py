@@ -201,7 +201,7 @@ class ForcedAttractor(Observer):
             repeats=repeats,
             extent=_Extent.none(lanes, len(osc.belts), winding.rises_begun),
             farthest=(zero, zero),
-            growth=Growth.none(lanes),
+            growth=Growth.none(lanes, has_second=True),
             winding=winding,
             kind=count,
             periods=count,
@@ -324,17 +324,16 @@ class ForcedAttractor(Observer):
         found = found & (~carried | (away <= STANDS_STILL * (1 + jnp.abs(x1))))
         # Nothing pulls a motion to one that lies beside others which repeat as well, and one from
         # which a tangent leads away is no attractor. A tangent may be lost in a stick phase on the
-        # way, once; so its growth is asked for since half of these strobes.
+        # way, once; so multipliers are those of the second half of these strobes.
         growth = seen.growth
         vanished = growth.size == -jnp.inf
-        gained, turns = growth.multiplier_since(known.d1, known.d2, known.log)
+        gained, is_complex = growth.multiplier_since(known.d1, known.d2, known.log)
         gained = jnp.where(vanished, -jnp.inf, gained)
         asked_for = (confirmed - known.asked).astype(x1.dtype) * _strobe_period(osc, seen.turns)
-        doubt = STILL + jnp.where(turns, ERRORS_OF_AREAS, ERRORS_OF_GROWTH) * asked_for
+        doubt = STILL + jnp.where(is_complex, ERRORS_OF_AREAS, ERRORS_OF_GROWTH) * asked_for
         asks = again & (known.asked == 0) & (2 * confirmed >= least) & ~vanished
         found = found & ~asks & (gained < doubt) & ((known.asked > 0) | vanished)
         kind = jnp.where(gained < -doubt, PERIODIC, FORCED_CONTINUUM)
-        begins = due & asks
         length = jnp.hypot(growth.d1, growth.d2)
         asked = jnp.where(asks, confirmed, jnp.where(fresh & ~again, 0, known.asked))
         repeats = _Repeats(
@@ -360,7 +359,7 @@ class ForcedAttractor(Observer):
             seen,
             strobes=jnp.where(due, now + 1, now).astype(now.dtype),
             repeats=choose(due, repeats, known),
-            growth=growth.with_frame(begins),
+            growth=growth.with_normal(due & asks),
             extent=choose(due, kept, seen.extent),
             loop_events=jnp.where(found, lanes.events - extent.events, seen.loop_events),
             loop_rises=jnp.where(found, rises - extent.rises, seen.loop_rises),
