@@ -400,3 +400,34 @@ def test_impossible_times_are_no_answers_and_harm_no_other_lane():
     assert np.all(np.isnan(ys[1:]))
     alone = jb.simulate(osc, (3.0, 0.0), 20.0, ts=[1.0, 2.0], rtol=1e-9)
     np.testing.assert_allclose(ys[0], alone.ys, atol=1e-9)
+
+
+@pytest.mark.slow(first=True)
+def test_impossible_runs_have_no_derivatives_and_harm_no_other_lane():
+    """A derivative of 0 would look like an extremum."""
+
+    def end(load, x1, edge, t1):
+        belt = jb.Belt(0.3, jb.Coulomb(1.0, 0.8), load, upper=edge)
+        return jb.simulate(jb.Oscillator(0.05, (belt,)), (x1, 0.0), t1, ts=t1[None]).ys[0, 0]
+
+    rows = [
+        (0.5, 1.0, 1.2, 4.0),
+        (0.5, 1.0, np.inf, 4.0),
+        (-1.0, 1.0, 1.2, 4.0),
+        (np.nan, 1.0, 1.2, 4.0),
+        (0.5, np.nan, 1.2, 4.0),
+        (0.5, 1.0, 1.2, 0.0),
+    ]
+    columns = [jnp.array(column) for column in zip(*rows, strict=True)]
+    values, slopes = jax.vmap(jax.value_and_grad(end, argnums=(0, 1, 2, 3)))(*columns)
+    assert np.all(np.isfinite(values[:2])) and np.all(np.isnan(values[2:]))
+    known, unknown = np.split(np.stack(slopes), [2], axis=1)
+    assert np.all(np.isfinite(known)) and np.all(np.isnan(unknown))
+    step = 1e-5
+    for row in rows[:2]:
+        for i in (0, 1, 3):
+            beside = [(*row[:i], row[i] + way * step, *row[i + 1 :]) for way in (1, -1)]
+            more, less = (end(*(jnp.asarray(value) for value in one)) for one in beside)
+            np.testing.assert_allclose(
+                slopes[i][rows.index(row)], (more - less) / (2 * step), rtol=0, atol=1e-7
+            )

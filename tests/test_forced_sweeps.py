@@ -48,6 +48,22 @@ def test_shift_by_a_period_changes_nothing(swept):
     assert np.allclose(later.x1_end.values[:, 0], here.x1_end.values, rtol=0, atol=1e-6)
 
 
+def test_an_axis_may_begin_with_the_frequency_0():
+    """Where it is known to be 0 the force is a constant one, without a clock."""
+    frequency = np.array([0.0, 1.7])
+
+    def swept(values):
+        axes = {"w": values}
+        return jb.sweep(lambda w: _cubic(0.1, w), axes, y0=(0.5, 0.0), t1=10.0, progress=False)
+
+    made = swept(frequency)
+    for w, x1, x2 in zip(frequency, made.x1_end.values, made.x2_end.values, strict=True):
+        alone = jb.simulate(_cubic(0.1, float(w)), (0.5, 0.0), 10.0, ts=[10.0])
+        np.testing.assert_allclose((x1, x2), alone.ys[0], rtol=0, atol=1e-7)
+    with pytest.raises(ValueError, match=r"^axes must be .* not 0 everywhere"):
+        swept(frequency[:1])
+
+
 @pytest.mark.parametrize(
     "options, message",
     [

@@ -43,6 +43,7 @@ from ..model.own_units import (
 from ..model.rest import start_at_focus
 from ..model.transitions import contact
 from ..numerics.compiling import jit, power_of_two
+from ..numerics.derivatives import nan_unless
 from ..results import EventKind, Status, describe, draw
 from ..tables import per_belt, require_single, table_of
 from .runs import Rules, arcs_of_run, stacked_codes, state_at_end, states_at
@@ -212,8 +213,9 @@ def _smoothed(given, y0, t0, t1, ts, rtol, atol, *, width, formulation, resoluti
     if ts is None:
         ts = t0 + (t1 - t0) * jnp.linspace(0.0, 1.0, resolution)
     field = switch_field if formulation == "switch" else smooth_field
-    possible = has_possible_numbers(osc)
-    ys = jnp.where(possible, integrate(field, osc, width, y0, t0, ts, rtol, atol), jnp.nan)
+    start_known = jnp.all(jnp.isfinite(y0)) & has_possible_numbers(osc)
+    ys = integrate(field, osc, width, y0, t0, ts, rtol, atol)
+    ys = nan_unless(start_known, ys, (given, y0, t0, t1, ts))
 
     def mode_at(y, *t):
         osc = at_time(own, *t) if t else own
@@ -222,7 +224,6 @@ def _smoothed(given, y0, t0, t1, ts, rtol, atol, *, width, formulation, resoluti
         return stacked_codes(contact(osc, y[0], y[1], rightward=True))
 
     known = jnp.all(jnp.isfinite(ys))
-    start_known = jnp.all(jnp.isfinite(y0)) & possible
     failure = jnp.where(start_known, Status.TOO_MANY_STEPS.value, Status.NOT_FINITE.value)
     integers, states = jnp.zeros(0, dtype=int), jnp.zeros((0, 2))
     found = Trajectory(
@@ -292,6 +293,8 @@ def _filippov(
         ends = t1, y1, mode1
         rows = jax.tree.map(lambda leaf, end: jnp.concatenate([leaf, end[None]]), rows, ends)
     ts, ys, modes = rows
+    possible = jnp.all(jnp.isfinite(y0)) & has_possible_numbers(osc)
+    ys, events, arcs = nan_unless(possible, (ys, events, arcs), (given, y0, t0, t1, ts))
     return in_given_units(Trajectory(ts, ys, modes, events, arcs, status), given, osc)
 
 
@@ -386,7 +389,8 @@ def simulate(
         require(width is None or formulation == of, name, expected, width)
     padded = not is_concrete((osc, y0, t0, t1, ts, rtol, atol))
     if padded:
-        y0 = jnp.where(_are_possible(t0, t1, ts, rtol), y0, jnp.nan)
+        y0 = jnp.asarray(y0)
+        y0 = nan_unless(_are_possible(t0, t1, ts, rtol), y0, y0)
     ends_at_t1 = ts is None or (
         is_concrete((ts, t1)) and np.size(ts) > 0 and bool(np.asarray(ts)[-1] == t1)
     )

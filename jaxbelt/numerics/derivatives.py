@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
+from jaxtyping import Array
 
 
 def moving_and_fixed(tree: Any, tangents: Any) -> tuple[Any, Any]:
@@ -74,3 +75,17 @@ def in_directions(
 
     changing, linear, others = jax.linearize(of_moving, moving, has_aux=True)
     return eqx.combine(changing, others), [linear(slope) for slope in slopes]
+
+
+def nan_unless(known: Array, values: Any, of: Any) -> Any:
+    """The values where `known`, else NaN with the derivative NaN by each number of `of`.
+
+    A NaN that `jnp.where` selects has the derivative 0, which looks like an extremum. known: one
+    truth value. values, of: trees; leaves that are not inexact are left as they are.
+    """
+    numbers = [jnp.asarray(leaf) for leaf in jax.tree.leaves(of) if eqx.is_inexact_array(leaf)]
+    # Some that are known are infinite, as edges are.
+    usable = [jnp.where(known & ~jnp.isfinite(leaf), 0.0, leaf) for leaf in numbers]
+    total = sum(jnp.sum(leaf) for leaf in usable)
+    factor = 1.0 + total * jnp.where(known, 0.0, jnp.nan)
+    return jax.tree.map(lambda leaf: factor * leaf if eqx.is_inexact_array(leaf) else leaf, values)

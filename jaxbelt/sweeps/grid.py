@@ -62,9 +62,7 @@ class Grid:
         check_arguments(make, self.names, "make", ", x1 or x2")
         # One oscillator of the sweep, for the structure and for what does not vary. It raises for
         # impossible values; runs that are not finite have a status.
-        finite = {name: self.axes[name][np.isfinite(self.axes[name])] for name in self.names}
-        first = {name: float(v[0]) if v.size else 0.0 for name, v in finite.items()}
-        self.example = make(**first)
+        self.example = make(**self._first(np.isfinite))
         kind = type(self.example).__name__
         came = f"one that returns {kind}{its_oscillator(self.example, 'return')}"
         require(isinstance(self.example, Oscillator), "make", returns, came)
@@ -72,11 +70,15 @@ class Grid:
         require(is_concrete(self.example), "make", known, "a traced one")
         check_scalars(self.example)
         self.edges = True
-        own = in_units_of_run(self.example, edges=True)
         self.mapped = traceable(self._varying, "make", returns)
+        own = in_units_of_run(self.example, edges=True)
+        if len(self.mapped) != len(jax.tree.leaves(own)):
+            # A force of a frequency that is known to be 0 is a constant one, of another structure.
+            self.example = make(**self._first(lambda values: np.isfinite(values) & (values != 0)))
+            own = in_units_of_run(self.example, edges=True)
         alike = len(self.mapped) == len(jax.tree.leaves(own))
-        expected = "frequencies other than 0, which make a constant force"
-        require(alike, "axes", expected, "0 as the first value of one")
+        expected = "such that a frequency is not 0 everywhere, which makes a constant force"
+        require(alike, "axes", expected, "one of zeros")
         which = jax.tree.unflatten(jax.tree.structure(own), self.mapped)
         self.edges = has_edges(own) or any(map(bool, interval_ends(which)))
         leaves, self.structure = jax.tree.flatten(in_units_of_run(self.example, edges=self.edges))
@@ -85,6 +87,11 @@ class Grid:
         self.shared = [jnp.asarray(leaf) for leaf, mapped in pairs if not mapped]
         #: `rows` of all runs of a small grid, by derivatives.
         self.known_rows: dict[tuple[str, ...], np.ndarray] = {}
+
+    def _first(self, usable: Callable[[np.ndarray], np.ndarray]) -> dict[str, float]:
+        """The first usable value of each axis, 0 where there is none."""
+        found = {name: self.axes[name][usable(self.axes[name])] for name in self.names}
+        return {name: float(values[0]) if values.size else 0.0 for name, values in found.items()}
 
     def _varying(self) -> tuple[bool, ...]:
         """For each leaf of the oscillator whether it depends on an axis."""
