@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
-from .forcing import Oscillating
+from .forcing import ConstantForce, Oscillating
 from .modes import (
     ABOVE,
     BELOW,
@@ -42,7 +42,8 @@ from .modes import (
     stick_rate,
     stick_velocity,
 )
-from .oscillator import MovingBelt, Oscillator, at_time
+from .oscillator import MovingBelt, Oscillator, at_time, fastest
+from .pseudofocus import ForceRange, is_captured
 from .transitions import codes_past_edge
 
 #: A state with a clock, (x1, x2, t).
@@ -52,8 +53,6 @@ TimedState = tuple[Array, Array, Array]
 GUARD_ROUNDING, EQUAL_VELOCITY = 1e-14, 2e-15
 #: Slopes and curvatures of a limit below these are zero; then the limit is asked a little later.
 LEAST_SLOPE, LEAST_CURVATURE, LATER = 1e-12, 1e-10, 1e-3
-#: Speed at an edge below which loops around a point on it are rounding of x1.
-LOST_AT_EDGE = 1e-7
 
 
 def blur(t: Array) -> Array:
@@ -371,14 +370,13 @@ def passed_guard(osc: Oscillator, mode: Mode, guard: Array, y: TimedState) -> In
         arrived = any_of([one & ~touched for one, touched in zip(zero, mode.touching, strict=True)])
         asks = stuck | arrived
         zero = [one & asks for one in zero]
-        past, a_past = resolved(osc, beyond, zero, [held_by], y)
+        past, _ = resolved(osc, beyond, zero, [held_by], y)
         after = select(at_edge, past, after)
-        a = mode_acceleration(at_time(osc, t), mode, y[0], x2)
-        inward = jnp.where(rightward, 1.0, -1.0)
-        pushed = (a * inward > 0) & (a_past * inward < 0)
-        captured = at_edge & ~stuck & ~past.any_stuck & pushed & (jnp.abs(x2) < LOST_AT_EDGE)
-        captured = captured & _pushes_for_ever(osc, mode, y, inward)
-        captured = captured & _pushes_for_ever(osc, past, y, -inward)
+        left, right = select(rightward, (mode, past), (past, mode))
+        captured = at_edge & is_captured(
+            at_time(osc, t), left, right, y[0], x2, _forces_around(osc, t)
+        )
+        captured = captured & _are_constant(osc, left) & _are_constant(osc, right)
     return Instant((y[0], jnp.where(captured, 0.0, x2), t), after, captured)
 
 
@@ -406,18 +404,33 @@ def _pushes_for_ever(osc: Oscillator, mode: Mode, y: TimedState, sign: ArrayLike
 
     Where that is not known, as with belts that oscillate, the answer is no.
     """
-    steady = jnp.asarray(True)
+    rest, bound = _pushes(osc, mode, y)
+    return _are_constant(osc, mode) & (sign * rest > bound)
+
+
+def _are_constant(osc: Oscillator, mode: Mode) -> Array:
+    """Whether no belt that touches the mass changes its velocity or its load."""
+    constant = jnp.asarray(True)
     for belt, touches in zip(osc.belts, mode.touching, strict=True):
         if isinstance(belt.velocity, Oscillating) or isinstance(belt.load, Oscillating):
-            steady = steady & ~touches
-    rest, bound = _pushes(osc, mode, y)
-    return steady & (sign * rest > bound)
+            constant = constant & ~touches
+    return constant
 
 
 def _pushes(osc: Oscillator, mode: Mode, y: TimedState) -> tuple[Array, Array]:
-    """The acceleration of a mode without the forces, and a bound of these at all times."""
-    now = at_time(osc, y[2])
-    forces = [force.force(y[2]) for force in now.forcing]
-    rest = mode_acceleration(now, mode, y[0], y[1]) - functools.reduce(jnp.add, forces)
-    bounds = [force.bound(osc.damping) for force in osc.forcing]
-    return rest, functools.reduce(jnp.add, bounds, jnp.zeros(()))
+    """The acceleration of a mode without waves of force, and a bound of these at all times."""
+    now, (force, bound) = at_time(osc, y[2]), _force_and_bound(osc, y[2])
+    return mode_acceleration(now, mode, y[0], y[1]) - force, bound
+
+
+def _force_and_bound(osc: Oscillator, t: Array) -> tuple[Array, Array]:
+    """The sum of the waves of force at the time t, and a bound of it at all times."""
+    waves, zero = [one for one in osc.forcing if not isinstance(one, ConstantForce)], jnp.zeros(())
+    forces = [one.on_mass(t, osc.damping) for one in waves]
+    bounds = [one.bound(osc.damping) for one in waves]
+    return functools.reduce(jnp.add, forces, zero), functools.reduce(jnp.add, bounds, zero)
+
+
+def _forces_around(osc: Oscillator, t: Array) -> ForceRange:
+    force, bound = _force_and_bound(osc, t)
+    return ForceRange(-bound - force, bound - force, fastest(osc))

@@ -1,5 +1,7 @@
 """The pseudo-focus at a contact edge, and when it captures an orbit."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -21,6 +23,8 @@ FOCUS_RADIUS = 1e-2
 FOCUS_SHARE = 4 * FOCUS_RADIUS
 #: Speed at the edge below which loops around it, as wide as its square, are rounding of x1.
 FOCUS_ROUNDING = 1e-7
+#: A loop is short where it takes less than this beside 1 / frequency of a force.
+SHORT_LOOP = 0.1
 
 
 class EdgeFocus(eqx.Module):
@@ -84,23 +88,72 @@ def _edge_focus(*sides: tuple[Array, ...]) -> EdgeFocus:
     return EdgeFocus(exists, k / slowness, e / slowness, bend / slowness)
 
 
-def is_captured(osc: Oscillator, left: Mode, right: Mode, edge: Array, x2: Array) -> Array:
+class ForceRange(eqx.Module):
+    """Forces that know the time, beside an oscillator at an instant.
+
+    least, most: what they may add to the acceleration at that instant, at all times; frequency: the
+    highest one of them.
+    """
+
+    least: Array
+    most: Array
+    frequency: Array
+
+
+def is_captured(
+    osc: Oscillator,
+    left: Mode,
+    right: Mode,
+    edge: Array,
+    x2: Array,
+    forces: ForceRange | None = None,
+) -> Array:
     """Whether an orbit that crosses the edge with velocity x2 is captured by a pseudo-focus there.
 
     The leading term of a loop must outweigh the next one by ten (see `EdgeFocus`), and no boundary
     may be near, and no other edge; edges that are one up to rounding are passed together. With a
     belt at rest, or with a fixed point on the edge, the loops shrink to rounding.
+
+    With forces all this must hold for the least and for the largest one. The sign of the rate is
+    that of a function linear in the force, so it holds between them. Loops are short beside a
+    period of the forces; then v^3 (1/a_L + 1/|a_R|) changes by the rate alone, and the
+    velocity v may grow as the force goes round by the cube root of how much that sum varies.
     """
     left = _past_all(osc, left, edge, x2)
     right = _past_all(osc, right, edge, x2, rightward=True)
     on_left, on_right = (field_at_rest(osc, mode, edge) for mode in (left, right))
-    focus = _edge_focus(on_left, on_right)
-    size = jnp.abs(x2)
     nearest, largest = jnp.inf, jnp.abs(edge)
     for belt, is_left, is_right in zip(osc.belts, left.touching, right.touching, strict=True):
         rubs, speed = (is_left | is_right) & (belt.load != 0), jnp.abs(belt.velocity) / osc.omega
         nearest = jnp.minimum(nearest, jnp.where(rubs, speed, jnp.inf))
         largest = jnp.maximum(largest, jnp.where(rubs, speed, 0.0))
+    size = jnp.abs(x2)
+    around, slow = [(on_left, on_right)], jnp.asarray(True)
+    if forces is not None:
+        around = [
+            tuple((side[0] + push, *side[1:]) for side in (on_left, on_right))
+            for push in (forces.least, forces.most)
+        ]
+        # 1/a_L + 1/|a_R| is convex in the force, and least where both are equal.
+        sums = [1 / one[0] - 1 / other[0] for one, other in around]
+        varies = 0.25 * jnp.maximum(*sums) * (on_left[0] - on_right[0])
+        slow = 2 * size * jnp.maximum(*sums) * forces.frequency < SHORT_LOOP
+        size = size * jnp.cbrt(varies)
+    speeds = size, nearest, largest
+    found = [_is_captured(osc, edge, sides, speeds) for sides in around]
+    return functools.reduce(jnp.logical_and, found, slow & ~left.any_stuck & ~right.any_stuck)
+
+
+def _is_captured(
+    osc: Oscillator,
+    edge: Array,
+    sides: tuple[tuple[Array, ...], ...],
+    speeds: tuple[Array, Array, Array],
+) -> Array:
+    """`is_captured` with the fields on both sides; speeds: of the mass, and the least and the
+    largest one of belts and edge."""
+    (on_left, on_right), (size, nearest, largest) = sides, speeds
+    focus = _edge_focus(on_left, on_right)
     captured = (
         focus.exists
         & (focus.rate < 0)
@@ -114,8 +167,7 @@ def is_captured(osc: Oscillator, left: Mode, right: Mode, edge: Array, x2: Array
     rounding = force_rounding(edge)
     pushed = (a_left > -rounding) & (a_right < rounding) & (a_left - a_right > rounding)
     shrinks = trace_right * jnp.maximum(a_left, 0) - trace_left * jnp.minimum(a_right, 0) < 0
-    captured = captured | pushed & (shrinks | (nearest == 0)) & (size < FOCUS_ROUNDING)
-    return captured & ~left.any_stuck & ~right.any_stuck
+    return captured | pushed & (shrinks | (nearest == 0)) & (size < FOCUS_ROUNDING)
 
 
 def _past_all(

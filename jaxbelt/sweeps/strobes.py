@@ -195,6 +195,7 @@ class ForcedAttractor(Observer):
             nowhere, nowhere, never, patience, count, count, count, *tangent, zero, far
         )
         winding = Winding.none(lanes)
+        rests = lanes.status == Status.PSEUDO_FOCUS.value
         return _RunSoFar(
             strobes=(passed + 1).astype(count.dtype),
             turns=turns,
@@ -203,11 +204,11 @@ class ForcedAttractor(Observer):
             farthest=(zero, zero),
             growth=Growth.none(lanes, has_second=True),
             winding=winding,
-            kind=count,
+            kind=jnp.where(rests, EQUILIBRIUM, count),
             periods=count,
             loop_events=count,
             loop_rises=count,
-            transient=nowhere,
+            transient=jnp.where(rests, lanes.t, nowhere),
         )
 
     # --- steps
