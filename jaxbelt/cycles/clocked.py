@@ -56,6 +56,7 @@ from .shooting import (
     end_guard,
     flow,
     jacobian,
+    late_at_end,
     over_mesh,
     slip_slopes,
     trace_of,
@@ -186,7 +187,7 @@ def _timed_arc_equations(
         left = after[2] - period * (1.0 if share is None else 1.0 + share)
         guard = jnp.where(end == names.period, left, end_guard(osc, codes, end, after))
         t = jnp.where(end == names.period, after[2] - period, after[2])
-        return jnp.stack([after[0], after[1], t, guard])
+        return jnp.stack([after[0], after[1] + late_at_end(osc, codes, end, after), t, guard])
 
     return lax.cond(any_lane(end != names.unused), followed, lambda unknown: unknown, unknown)
 

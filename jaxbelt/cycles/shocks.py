@@ -138,7 +138,9 @@ class FatalShock(eqx.Module):
             return f"FatalShock({self.attractor} to {self.boundary})"
         text = f"FatalShock({self.attractor}, {self.direction}: {number(self.distance)}"
         if self.boundary != "none":
-            start, shock = (", ".join(map(number, one)) for one in (self.start, self.shock))
+            # Beside the distance a component may be rounding.
+            shock = np.where(np.abs(self.shock) > 1e-15 * self.distance, self.shock, 0.0)
+            start, shock = (", ".join(map(number, one)) for one in (self.start, shock))
             text += f", from ({start}) by ({shock}) to {self.boundary}, beyond it {self.beyond}"
         if int(self.status) != Status.OK:
             text += f"; {Status(int(self.status)).name}: {describe(self.status)}"

@@ -33,14 +33,17 @@ from jaxtyping import Array
 from ..model.instants import carried, field_at
 from ..model.modes import (
     Mode,
+    any_of,
     capacity,
     edges,
+    first_of,
+    has_edges,
     mode_acceleration,
     mode_of,
     stick_velocity,
 )
 from ..model.oscillator import Oscillator, at_time, has_clock
-from ..model.transitions import onset_position
+from ..model.transitions import late_contacts, onset_position
 from ..motion.arcs import Ends
 from ..motion.integrators import density
 from ..numerics.compiling import any_lane, lanes_in_one_kernel, one_kernel, one_kernel_alone
@@ -300,6 +303,18 @@ def _timed_end_guard(osc: Oscillator, codes: Array, end: Array, y: Array) -> Arr
     return sum((jnp.where(end == i, value, 0.0) for i, value in numbers), jnp.zeros(()))
 
 
+def late_at_end(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
+    """`late_contacts` at the end y of an arc, 0 where that is no edge."""
+    mode, numbers = mode_of(codes), [len(osc.belts) + i for i in range(2 * len(osc.belts))]
+    if not has_edges(osc):
+        return jnp.zeros(())
+    at_edge = [end == number for number in numbers]
+    edge = first_of(at_edge, edges(osc), y[0])
+    now = at_time(osc, y[2]) if has_clock(osc) else osc
+    late = late_contacts(now, mode, edge, y[1], y[1] > 0)
+    return jnp.where(any_of(at_edge), late, 0.0)
+
+
 def trace_of(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
     """Divergence of the field of a slip mode, d(x2')/d(x2), as a vector of one."""
     _, slope = jax.jvp(lambda v: mode_acceleration(osc, mode, x1, v), (x2,), (jnp.ones_like(x2),))
@@ -357,11 +372,15 @@ def _followed(osc: Oscillator, codes, end, mesh, backwards, unknown: Array) -> A
         velocity = velocity + jnp.where(end == names.tangent + i, belt.velocity / osc.omega, 0.0)
     x1 = mode_acceleration(osc, mode_of(codes), jnp.zeros(()), velocity)
     point = jnp.stack([x1, velocity])
-    start = jnp.where(is_tangent, point, unknown[:2])
+    late = late_at_end(osc, codes, end, unknown[:2])
+    start = jnp.stack([unknown[0], unknown[1] - jnp.where(backwards, late, 0.0)])
+    start = jnp.where(is_tangent, point, start)
     back = is_tangent | backwards
     duration = jnp.where(back, -unknown[2], unknown[2])
     after = flow(osc, codes, jnp.where(back, jnp.flip(mesh), mesh), start, duration)
     guard = end_guard(osc, codes, end, jnp.where(backwards, unknown[:2], after))
+    late = jnp.where(backwards, 0.0, late_at_end(osc, codes, end, after))
+    after = jnp.stack([after[0], after[1] + late])
     ordinary = jnp.concatenate([after, guard[None], jnp.zeros(1)])
     return jnp.where(is_tangent, jnp.concatenate([point, after - unknown[:2]]), ordinary)
 

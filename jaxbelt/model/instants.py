@@ -44,7 +44,7 @@ from .modes import (
 )
 from .oscillator import MovingBelt, Oscillator, at_time, fastest
 from .pseudofocus import ForceRange, is_captured
-from .transitions import codes_past_edge
+from .transitions import codes_past_edge, late_contacts
 
 #: A state with a clock, (x1, x2, t).
 TimedState = tuple[Array, Array, Array]
@@ -323,7 +323,10 @@ def on_guard_at(osc: Oscillator, mode: Mode, guard: Array, y: TimedState) -> Tim
         return x1, jnp.where(mode.any_stuck, x2, x2_slip), t
     at_edge = [guard == n + i for i in range(2 * n)]
     x1 = first_of(at_edge, edges(osc), x1)
-    return x1, jnp.where(mode.any_stuck, x2, x2_slip), t
+    flags = zip(at_edge, bounds_rightward(mode), strict=True)
+    rightward = any_of([one & right for one, right in flags])
+    late = jnp.where(any_of(at_edge), late_contacts(now, mode, x1, x2, rightward), 0.0)
+    return x1, jnp.where(mode.any_stuck, x2, x2_slip + late), t
 
 
 def passed_guard(osc: Oscillator, mode: Mode, guard: Array, y: TimedState) -> Instant:

@@ -122,7 +122,7 @@ def is_captured(
     left = _past_all(osc, left, edge, x2)
     right = _past_all(osc, right, edge, x2, rightward=True)
     on_left, on_right = (field_at_rest(osc, mode, edge) for mode in (left, right))
-    nearest, largest = jnp.inf, jnp.abs(edge)
+    nearest, largest = jnp.asarray(jnp.inf), jnp.abs(edge)
     for belt, is_left, is_right in zip(osc.belts, left.touching, right.touching, strict=True):
         rubs, speed = (is_left | is_right) & (belt.load != 0), jnp.abs(belt.velocity) / osc.omega
         nearest = jnp.minimum(nearest, jnp.where(rubs, speed, jnp.inf))

@@ -126,6 +126,42 @@ def codes_past_edge(
     return Mode(tuple(codes))
 
 
+@eqx.filter_custom_jvp
+def late_contacts(
+    osc: Oscillator, mode: Mode, edge: Array, x2: Array, rightward: Array | bool
+) -> Array:
+    """0: what x2 gains in slip because other edges at the same place are passed a little sooner or
+    later than this one, which moves by itself.
+
+    Its derivatives are not 0. A belt whose contact changes x2' by a does so (its edge - edge) / x2
+    later, and what it does then adds up with what the others do.
+    """
+    return jnp.zeros_like(x2)
+
+
+@late_contacts.def_jvp
+def _(primals, tangents):
+    osc, mode, edge, x2, rightward = primals
+    along, _, edge_along, *_ = tangents
+    none = jnp.zeros_like(x2)
+    if along is None or len(osc.belts) == 1:
+        return none, none
+    after = codes_past_edge(osc, mode, edge, osc.omega * x2, rightward)
+    before, total = mode_acceleration(osc, mode, edge, x2), none
+    for i, belt in enumerate(along.belts):
+        leaves = mode.touching[i] & ~after.touching[i]
+        changes = leaves | ~mode.touching[i] & after.touching[i]
+        codes = (*mode.codes[:i], after.codes[i], *mode.codes[i + 1 :])
+        more = mode_acceleration(osc, Mode(codes), edge, x2) - before
+        lower, upper, here = (
+            moved if eqx.is_array(moved) else none for moved in (belt.lower, belt.upper, edge_along)
+        )
+        later = jnp.where(leaves == rightward, upper, lower) - here
+        total = total - jnp.where(changes, more * later, 0.0)
+    slips = ~mode.any_stuck & ~after.any_stuck & (x2 != 0)
+    return none, jnp.where(slips, total / jnp.where(slips, x2, 1.0), 0.0)
+
+
 def _slip_sign(velocity: Array, speed: Array) -> Array:
     """Sign of velocity - speed; 0 where they are equal but for the rounding of nu/omega."""
     same = jnp.abs(velocity - speed) <= ULPS * jnp.abs(velocity)
@@ -260,6 +296,7 @@ def _guard_of(osc: Oscillator, mode: Mode, guard: Array, x1: Array, x2: Array) -
     released, end = _released_at_edge(osc, held, x1, x2_boundary)
     on_end = at_boundary & released
     x1_after = jnp.where(at_edge, edge, jnp.where(on_end, end, x1))
+    x2_after = x2_after + jnp.where(at_edge, late_contacts(osc, mode, edge, x2, rightward), 0.0)
     there = edge, rightward, on_end, end
     return _Guard(at_boundary, at_edge, x1_after, x2_after, held, x2_boundary, *there)
 
