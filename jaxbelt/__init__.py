@@ -11,7 +11,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     activity        progress of functions that take long
     identity        fingerprints of values and functions
     interrupts      interrupts that are not lost
-    numerics/       spacing widths programs compiling
+    numerics/       spacing widths programs usercode compiling
     checks          arguments, checked at the public edge
     dimensions      dimensions of fields and results
     tables          results as tables

@@ -91,11 +91,25 @@ def fingerprint_or_unique(value: Any) -> Any:
         return object()
 
 
+def own_parts(value: Any) -> list[Any]:
+    """The functions, classes and objects of a user's own that a value is made of, each by itself
+    and not what it reaches; none where the value has no fingerprint."""
+    reading = _Reading("a value")
+    try:
+        reading.digest(value, "")
+    except FingerprintError:
+        return []
+    return reading.own
+
+
 class _Reading:
-    """One call of `fingerprint`: the digests of the objects that were met."""
+    """One call of `fingerprint`: the digests of the objects that were met, and of the user's own
+    ones those that no other one led to."""
 
     def __init__(self, name: str):
         self.name = name
+        self.own: list[Any] = []
+        self.inside_own = False
         self.known: dict[int, str] = {}
         self.open: list[int] = []
         # Keeps objects alive, so that no id is used twice.
@@ -111,10 +125,15 @@ class _Reading:
         if key not in self.known:
             self.alive.append(value)
             self.open.append(key)
+            begins = not self.inside_own and _is_users(value)
+            if begins:
+                self.own.append(value)
+                self.inside_own = True
             try:
                 self.known[key] = _digest_of(*self.parts(value, place))
             finally:
                 self.open.pop()
+                self.inside_own = self.inside_own and not begins
         return self.known[key]
 
     def parts(self, value: Any, place: str) -> Iterator[str]:
@@ -300,6 +319,16 @@ def _digest_of(*parts: str) -> str:
 
 def _as_pickled(value: Any) -> Any:
     return value.__reduce_ex__(4)
+
+
+def _is_users(value: Any) -> bool:
+    """Whether something is a user's own function or class, or an object of such a class."""
+    if isinstance(value, FunctionType):
+        return _package_of(value.__globals__.get("__name__")) is None
+    kind = value if isinstance(value, type) else type(value)
+    # Modules in C have no file, and may not be there.
+    top = kind.__module__.partition(".")[0]
+    return top in sys.modules and not (_package_of(kind.__module__) or _package_of(top))
 
 
 def _content(cell: Any) -> Any:

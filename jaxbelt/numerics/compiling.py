@@ -29,7 +29,7 @@ import numpy as np
 from jax import lax
 from jax.core import Tracer
 
-from . import programs
+from . import programs, usercode
 from .widths import SideBySide, is_cpu
 
 #: Whether to use only what is promised.
@@ -135,12 +135,13 @@ def jit(function: Callable) -> Any:
     def call(*args, **kwargs):
         require_own_threads()
         leaves, structure = jax.tree.flatten((args, kwargs))
-        if not is_outermost(leaves):
-            return plain(*args, **kwargs)
-        program, arrays = kept.program(leaves, structure)
-        if program is not None:
-            return program(arrays)
-        return quick()(*args, **kwargs) if known(QUICK) else plain(*args, **kwargs)
+        with usercode.watched(leaves, structure):
+            if not is_outermost(leaves):
+                return plain(*args, **kwargs)
+            program, arrays = kept.program(leaves, structure)
+            if program is not None:
+                return program(arrays)
+            return quick()(*args, **kwargs) if known(QUICK) else plain(*args, **kwargs)
 
     return call
 
@@ -159,8 +160,10 @@ def wide(function: Callable) -> Any:
 
     @functools.wraps(function)
     def call(*args):
-        program, arrays = kept.program(*jax.tree.flatten((args, {})))
-        return plain(bool(options()))(*args) if program is None else program(arrays)
+        leaves, structure = jax.tree.flatten((args, {}))
+        with usercode.watched(leaves, structure):
+            program, arrays = kept.program(leaves, structure)
+            return plain(bool(options()))(*args) if program is None else program(arrays)
 
     return call
 
@@ -182,6 +185,7 @@ class _Kept:
         self.called: dict[Any, programs.KeptProgram | None] = {}
         self.made: dict[str, programs.KeptProgram] = {}
         self.locks: dict[Any, Any] = {}
+        usercode.forgotten_with_programs(self.called.clear)
 
     def program(self, leaves: list[Any], structure: Any) -> tuple[Any, list[Any]]:
         """The program of these arguments, and the arrays among them; None: it cannot be kept."""
