@@ -75,6 +75,27 @@ def test_a_sweep_past_edges_at_one_place():
         assert found[1] == pytest.approx(0.5 * (found[0] + found[2]), abs=1e-5)
 
 
+@pytest.mark.slow(first=True)
+def test_a_cycle_that_slips_on_where_its_belt_ends_and_another_one_begins():
+    """Both sides differ: where both belts touch the mass it is stuck until the first one ends."""
+    law = jb.Conti(1.0, 0.6, 10.0)
+
+    def make(edges):
+        belts = jb.Belt(0.4, law, upper=edges[0]), jb.Belt(-0.3, law, lower=edges[1])
+        return jb.Oscillator(0.1, belts)
+
+    def numbers(edges):
+        cycle = jb.find_cycle(make(edges), (3.0, 0.0))
+        return jnp.stack([cycle.period, cycle.x1_max])
+
+    found, h = jax.jacfwd(numbers)(EDGES), 1e-5
+    both = EDGES + jnp.array([h, -h])
+    for i, way in ((0, 1), (1, -1)):
+        one = jnp.zeros(2).at[i].set(way * h)
+        right = way * (numbers(both + one) - numbers(both)) / h
+        np.testing.assert_allclose(found[:, i], right, rtol=0, atol=1e-3)
+
+
 @pytest.mark.parametrize(
     "forcing",
     [

@@ -43,7 +43,7 @@ from ..model.modes import (
     stick_velocity,
 )
 from ..model.oscillator import Oscillator, at_time, has_clock
-from ..model.transitions import late_contacts, onset_position
+from ..model.transitions import acting_edge, late_contacts, onset_position
 from ..motion.arcs import Ends
 from ..motion.integrators import density
 from ..numerics.compiling import any_lane, lanes_in_one_kernel, one_kernel, one_kernel_alone
@@ -266,6 +266,17 @@ def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, 
     return jnp.where(stuck, stuck_end, slipped)
 
 
+def edge_at_end(osc: Oscillator, mode: Mode, end: Array) -> Array:
+    """The place of the edge at which an arc of a mode ends; 0 where it ends otherwise."""
+    none = jnp.zeros(())
+    if not has_edges(osc):
+        return none
+    numbers = [end == len(osc.belts) + i for i in range(2 * len(osc.belts))]
+    place = first_of(numbers, edges(osc), none)
+    flags = [any_of(numbers) & (edge == place) for edge in edges(osc)]
+    return acting_edge(osc, mode, flags, none)
+
+
 def end_guard(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
     """What vanishes at y if an arc ends there by `end`; zero for an unused one."""
     if has_clock(osc):
@@ -273,7 +284,7 @@ def end_guard(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
     mode = mode_of(codes)
     values = [
         *[belt.velocity - osc.omega * y[1] for belt in osc.belts],
-        *[jnp.where(jnp.isfinite(edge), y[0] - edge, 1.0) for edge in edges(osc)],
+        *[y[0] - edge_at_end(osc, mode, end)] * (2 * len(osc.belts)),
         mode_acceleration(osc, mode, y[0], y[1]),
         y[1],
         y[0] - onset_position(osc, mode),
@@ -294,7 +305,7 @@ def _timed_end_guard(osc: Oscillator, codes: Array, end: Array, y: Array) -> Arr
     n, names = len(osc.belts), Ends(len(osc.belts))
     numbers = [
         *((i, values[i]) for i in range(n)),
-        *((n + i, jnp.where(jnp.isfinite(e), y[0] - e, 1.0)) for i, e in enumerate(edges(osc))),
+        *((n + i, y[0] - edge_at_end(osc, mode, end)) for i in range(2 * n)),
         (names.extremum_x1, y[1]),
         (names.onset, values[n]),
         *((names.tangent + i, slopes[i]) for i in range(n)),
@@ -305,14 +316,12 @@ def _timed_end_guard(osc: Oscillator, codes: Array, end: Array, y: Array) -> Arr
 
 def late_at_end(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
     """`late_contacts` at the end y of an arc, 0 where that is no edge."""
-    mode, numbers = mode_of(codes), [len(osc.belts) + i for i in range(2 * len(osc.belts))]
+    mode, n = mode_of(codes), len(osc.belts)
     if not has_edges(osc):
         return jnp.zeros(())
-    at_edge = [end == number for number in numbers]
-    edge = first_of(at_edge, edges(osc), y[0])
     now = at_time(osc, y[2]) if has_clock(osc) else osc
-    late = late_contacts(now, mode, edge, y[1], y[1] > 0)
-    return jnp.where(any_of(at_edge), late, 0.0)
+    late = late_contacts(now, mode, edge_at_end(osc, mode, end), y[1], y[1] > 0)
+    return jnp.where((end >= n) & (end < 3 * n), late, 0.0)
 
 
 def trace_of(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:

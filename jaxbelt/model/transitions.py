@@ -126,6 +126,18 @@ def codes_past_edge(
     return Mode(tuple(codes))
 
 
+def acting_edge(osc: Oscillator, mode: Mode, flags: Sequence[Array], default: Array) -> Array:
+    """The place of those of `edges` whose flag is set, which are at one place.
+
+    Its derivatives are those of the edge of the belt that the mass is stuck to, where that is one
+    of them, for there it slips on; else see `foremost`.
+    """
+    own = [flag & stuck for flag, stuck in zip(flags, (*mode.stuck, *mode.stuck), strict=True)]
+    leaves = any_of(own)
+    flags = [jnp.where(leaves, one, flag) for one, flag in zip(own, flags, strict=True)]
+    return foremost(osc, flags, edges(osc), default)
+
+
 @eqx.filter_custom_jvp
 def late_contacts(
     osc: Oscillator, mode: Mode, edge: Array, x2: Array, rightward: Array | bool
@@ -221,7 +233,7 @@ def stick_phase(osc: Oscillator, mode: Mode, x1: Array) -> StickPhase:
         rounding = ON_GUARD * (1 + jnp.abs(x1_onset) + capacity(osc, mode))
         slips = (onset_distance + rounding < to_edge) | jnp.isinf(to_edge)
         at_edge = [~slips & (distance <= to_edge) for distance in distances]
-        x1_end = jnp.where(slips, x1_onset, foremost(osc, at_edge, edges(osc), x1))
+        x1_end = jnp.where(slips, x1_onset, acting_edge(osc, mode, at_edge, x1))
     # Not distance/|v|: x1_end does not depend on x1, and so neither do its derivatives.
     duration = (x1_end - x1) / v_or_one
     # Negative by rounding only; its derivatives are those of the quotient there, too.
@@ -290,7 +302,7 @@ def _guard_of(osc: Oscillator, mode: Mode, guard: Array, x1: Array, x2: Array) -
         return _Guard(at_boundary, at_edge, x1, x2_after, held, x2_boundary, *edgeless)
     edge_hit = [guard == n + i for i in range(2 * n)]
     edge = first_of(edge_hit, edges(osc), x1)
-    edge = foremost(osc, [other == edge for other in edges(osc)], edges(osc), edge)
+    edge = acting_edge(osc, mode, [other == edge for other in edges(osc)], edge)
     flags = zip(edge_hit, bounds_rightward(mode), strict=True)
     rightward = any_of([hit & right for hit, right in flags])
     released, end = _released_at_edge(osc, held, x1, x2_boundary)
