@@ -308,3 +308,50 @@ def test_a_diagram_comes_to_its_end_where_runs_end_on_a_moment(frequency):
     options = dict(y0=(1.0, 0.0), sense="up", rows=2)
     found = jb.orbit_diagram(osc, lambda osc: osc.forcing[0].amplitude, (0.8, 0.9), **options)
     assert set(found.status.ravel().tolist()) == {jb.Status.OK}
+
+
+@pytest.mark.slow(first=True)
+def test_a_mass_that_a_belt_at_rest_holds_has_no_period():
+    """A force below friction moves nothing: the mass stays where it is, while the force falls,
+    too."""
+
+    def make(force):
+        return jb.presets.den_hartog(0.5, force)
+
+    options = dict(span=(0.0, 0.6), rows=7)
+    found = jb.orbit_diagram(make, y0=[(0.1, 0.0), (-0.05, 0.0)], **options)
+    moves = found.values > 0.45
+    assert np.all(found.kind[moves] == "cycle") and np.all(found.kind[:4] == "stuck")
+    assert np.all(found.status[:4] == jb.Status.STUCK_FOREVER)
+    # |force cos| + |x1| < 0.4 up to a force of 0.2.
+    np.testing.assert_array_equal(found.x1[:3, :, 0], [[0.1, -0.05]] * 3)
+    assert np.all(found.x2[:4, :, 0] == 0) and np.all(np.isnan(found.period[:4]))
+    assert np.all(np.sum(np.isfinite(found.x1[:4]), axis=-1) == 1)
+    table = found.table()
+    held = table[table.kind == "stuck"]
+    assert len(held) == np.sum(found.kind == "stuck") and held.period.isna().all()
+    assert "stuck for ever" in found.plot().get_legend_handles_labels()[1]
+    swept = jb.sweep(make, {"force": found.values[:3]}, y0=(0.1, 0.0), observe="attractor")
+    assert np.all(jb.decoded(swept).kind == "stuck")
+
+    both = jb.orbit_diagram(make, y0=(0.1, 0.0), sense="both", **options)
+    up, down = both.kind[both.values < 0.35].T
+    assert set(up) == set(down) == {"stuck"}
+    np.testing.assert_array_equal(both.x1[:3, 0, 0], 0.1)
+    # What held it at 0.3 holds it at smaller forces, at the same place.
+    assert len(np.unique(both.x1[:4, 1, 0])) == 1
+
+
+@pytest.mark.slow(first=True)
+def test_a_forced_mass_at_rest_on_an_edge_is_an_equilibrium():
+    """On the left friction pushes to the edge, on the right the spring does, at all times."""
+
+    def make(force):
+        belt = jb.Belt(1.0, jb.Coulomb(1.0, 1.0), upper=0.5)
+        return jb.Oscillator(0.3, (belt,), forcing=jb.Harmonic(force, 0.7))
+
+    found = jb.orbit_diagram(make, span=(0.1, 0.4), y0=(1.0, 0.3), rows=3, sense="both")
+    assert np.all(found.kind == "equilibrium") and np.all(np.isnan(found.period))
+    assert np.all(found.status == jb.Status.PSEUDO_FOCUS)
+    assert np.all(found.x1[..., 0] == 0.5) and np.all(np.isnan(found.x1[..., 1:]))
+    assert len(found.table()) == 6 and np.all(found.table().x2 == 0)

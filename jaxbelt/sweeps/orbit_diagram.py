@@ -38,7 +38,7 @@ from ..numerics.spacing import evenly_spaced
 from ..results import Status, draw
 from ..tables import table_of
 from .along import Along
-from .attractor import CYCLE, EQUILIBRIUM, KINDS, UNDECIDED, Attractor
+from .attractor import CYCLE, EQUILIBRIUM, KINDS, STUCK_FOR_EVER, UNDECIDED, Attractor
 from .grid import Grid
 from .moments import AtEvents, AtExtrema, AtPhase, AtSection
 from .question import LONG_ENOUGH
@@ -63,7 +63,8 @@ PERIODS_LEFT_OUT, PERIODS_LEFT_OUT_BESIDE, STROBES = 1000, 500, 64
 #: Lanes of a run that begins where another one has ended.
 LANES_OF_FEW = 4
 #: Such a run begins so far from an equilibrium or a periodic forced motion, in own units: these may
-#: have become unstable, and a run that begins on one would stay.
+#: have become unstable, and a run that begins on one would stay. It begins where a mass is stuck
+#: for ever: else the mass would creep with the parameter.
 OFF_ATTRACTOR = 1e-3
 #: In which sense the parameter changes where runs begin so.
 SENSES = {"up": ("up",), "down": ("down",), "both": ("up", "down")}
@@ -81,7 +82,7 @@ class OrbitDiagram(eqx.Module):
         period: Periods of cycles, else NaN, [values, starts].
         status: A `Status` each, [values, starts].
         x1: Points of the attractors, [values, starts, points], dimensionless, NaN where there are
-            fewer: of a cycle one for each of its moments, in their order; of an equilibrium its
+            fewer: of a cycle one for each of its moments, in their order; of a mass at rest its
             place.
         x2: Velocities at these points, likewise.
         at: The moments.
@@ -318,17 +319,22 @@ class Sampling:
             *state, last = reducer.last_state(found)
             passed[following] = (passed[which] + left_out + last) % turns[following]
             times = (self.at.phase / (2 * np.pi) + passed[following]) * period[following]
-            return np.stack([*(x + off for x in state), times])
+            rests, away = _at_rest(found), np.where(found["status"] == Status.STUCK_FOREVER, 0, off)
+            ends = (np.where(rests, found[at], x) for at, x in zip(ENDS_AT, state, strict=True))
+            return np.stack([*(x + away for x in ends), times])
 
         found = self._from_starts(grid, Along(reducer), further, t1, t0=0.0)
         x1, x2 = reducer.columns(found)
         # Runs of other frequencies may have a period less.
         status = found["status"].astype(int)
-        good = (status == Status.OK) | (status == Status.STUCK_FOREVER)
-        x1[~good], x2[~good] = np.nan, np.nan
+        x1[status != Status.OK], x2[status != Status.OK] = np.nan, np.nan
         turns = _turns_in(x1, x2)
         kind = np.where(turns > 0, KINDS[CYCLE], NOT_PERIODIC)
-        kind = np.where(good, kind, KINDS[UNDECIDED])
+        kind = np.where(status == Status.OK, kind, KINDS[UNDECIDED])
+        for at_rest, code in RESTS.items():
+            kind[status == at_rest] = KINDS[code]
+        rests = _at_rest(found)
+        x1[rests, 0], x2[rests, 0] = (found[at][rests] for at in ENDS_AT)
         once = (turns[:, None] > 0) & (np.arange(STROBES) >= turns[:, None])
         x1, x2 = (np.where(once, np.nan, x) for x in (x1, x2))
         period = np.where(turns > 0, turns * period, np.nan)
@@ -458,6 +464,11 @@ def _beside_attractor(grid: Grid) -> Callable[..., np.ndarray]:
     return state
 
 
+def _at_rest(found: dict[str, np.ndarray]) -> np.ndarray:
+    """Which forced runs have come to rest, by their results."""
+    return np.isin(found["status"], list(RESTS))
+
+
 def _turns_in(x1: np.ndarray, x2: np.ndarray) -> np.ndarray:
     """After how many points rows of them repeat, all of them, half as many at most; 0: not."""
     turns = np.zeros(len(x1), dtype=int)
@@ -472,6 +483,10 @@ def _turns_in(x1: np.ndarray, x2: np.ndarray) -> np.ndarray:
 EXTREMUM, OWN = 0, 1
 #: Results of `Attractor` with the place of an attractor at rest.
 RESTS_AT = ("x1_min", "x2_min")
+#: Kinds of forced runs that have come to rest, by their status, and results of `_KeptMoments` with
+#: the state at the end of a run.
+RESTS = {Status.STUCK_FOREVER: STUCK_FOR_EVER, Status.PSEUDO_FOCUS: EQUILIBRIUM}
+ENDS_AT = ("x1 at the end", "x2 at the end")
 
 
 #: Moments are kept in pieces of so many: larger arrays in all lanes make a slow kernel.
@@ -481,7 +496,8 @@ PIECE_KEPT = 8
 @dataclass(frozen=True)
 class _KeptMoments:
     """The first `room` moments of a run behind some that are skipped: of t, x1, x2 and the moment's
-    number in `at` those in `kept`. A reducer, see `sweep.sweep`; room: a multiple of PIECE_KEPT."""
+    number in `at` those in `kept`, and the state at the end. A reducer, see `sweep.sweep`; room: a
+    multiple of PIECE_KEPT."""
 
     at: tuple[Any, ...]
     room: int
@@ -508,11 +524,12 @@ class _KeptMoments:
         return tuple(map(put, self.kept, known)), count + 1
 
     def finish(self, state, end):
-        return {
+        pieces = {
             f"{name} {i}": piece
             for name, pieces in zip(self.kept, state[0], strict=True)
             for i, piece in enumerate(pieces)
         }
+        return pieces | dict(zip(ENDS_AT, (end.x1, end.x2), strict=True))
 
     def last_state(self, found: dict[str, np.ndarray]) -> tuple[np.ndarray, ...]:
         """The last (x1, x2) that was kept of runs, [runs], NaN where there is none, and which of
