@@ -19,6 +19,7 @@ import xarray as xr
 import zarr
 
 import jaxbelt as jb
+from jaxbelt.sweeps import question as questions
 from jaxbelt.sweeps import store as stores
 from jaxbelt.sweeps.grid import Blocks, Grid
 from jaxbelt.sweeps.locks import locked
@@ -393,6 +394,39 @@ def test_which_parameters_vary_belongs_to_the_question(tmp_path):
     jb.sweep(of_damping, axes, y0=(1.0, 0.0), t1=20.0, store=store)
     with pytest.raises(ValueError, match="which differs in make"):
         jb.sweep(of_velocity, axes, y0=(1.0, 0.0), t1=20.0, store=store)
+
+
+def test_every_run_of_a_large_grid_belongs_to_the_question(monkeypatch):
+    law = jb.Conti(1.0, 0.6, 10.0)
+    axes = {"nu": np.linspace(0.0, 2.0, 20_001)}
+    number = 1006
+    assert number not in np.linspace(0, 20_000, questions.SAMPLE).astype(int)
+
+    def identity(damping, there):
+        def make(nu):
+            here = jnp.abs(nu - axes["nu"][number]) < 5e-5
+            return jb.Oscillator(jnp.where(here, there, damping + 0 * nu), (jb.Belt(nu, law),))
+
+        return Question.of(make, axes, (3.0, 0.0), 1.0, 1e-8, None, "final", ()).identity()
+
+    def differing(one, other):
+        return {name for name in one if one[name] != other[name]}
+
+    first, more = identity(0.5, 0.5), np.nextafter(0.5, 1)
+    assert differing(first, identity(0.5, 0.3)) == {"make"}
+    # Rounding on another machine makes no other `make`.
+    assert not differing(first, identity(0.5, more))
+    assert differing(first, identity(more, 0.5)) == {"oscillator"}
+    # Of a grid with too many points some are left out.
+    monkeypatch.setattr(questions, "MOST_COUNTED", 100)
+    assert not differing(identity(0.5, 0.5), identity(0.5, 0.3))
+    assert "make" in differing(identity(0.5, 0.5), identity(0.3, 0.5))
+
+
+def test_the_docs_tell_at_how_many_points_a_sweep_is_another():
+    words = " ".join(jb.sweep.__doc__.split())
+    assert f"at {questions.SAMPLE:,} points of the grid to eleven digits" in words
+    assert f"at {questions.MOST_COUNTED:,} points" in words
 
 
 @pytest.mark.slow

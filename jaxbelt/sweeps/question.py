@@ -52,8 +52,9 @@ NAMED_FORCED: dict[str, type[Observer]] = {
     "attractor": ForcedAttractor,
     "lyapunov": LargestExponent,
 }
-#: Largest number of points of the grid that identify `make`; the same on every machine.
-SAMPLE = 2**14
+#: Largest numbers of points of the grid at which `make` counts to eleven digits, and to seven; the
+#: same on every machine.
+SAMPLE, MOST_COUNTED = 2**14, 2**24
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,22 +163,17 @@ class Question:
         """Identity of the sweep, by the names of the arguments; equal for two sweeps that are the
         same.
 
-        `make` counts by what it returns, at up to `SAMPLE` points of the grid: its numbers to
-        eleven digits, which do not depend on the machine, and the friction laws of its oscillator
-        by their types, numbers and, if they are not this package's, their fingerprints.
+        `make` counts by what it returns, see `_made`, and the friction laws of its oscillator by
+        their types, numbers and, if they are not this package's, their fingerprints.
         """
         grid = self.grid
-        sample = np.unique(np.linspace(0, grid.runs - 1, SAMPLE).astype(int))
-        rows = grid.rows(sample)
         leaves, _ = jax.tree_util.tree_flatten_with_path(grid.example)
         parameters = [f"{jax.tree_util.keystr(path)}={float(leaf)!r}" for path, leaf in leaves]
         identity = {f"axis {name}": _hash(axis.tobytes()) for name, axis in grid.axes.items()}
         identity["axes"] = ", ".join(f"{name} ({axis.size})" for name, axis in grid.axes.items())
         identity["y0"] = repr(tuple(grid.y0.values()))
         identity["oscillator"] = ", ".join(parameters)
-        varying = " ".join(str(number) for number, varies in enumerate(grid.mapped) if varies)
-        numbers = " ".join(f"{x:.10e}" for x in rows.ravel().tolist())
-        identity["make"] = _hash(f"{varying}: {numbers}".encode())
+        identity["make"] = self._made
         for i, belt in enumerate(grid.example.belts):
             shown, name = _plain(repr(belt.friction)), f"the law of belt {i}"
             identity[name] = f"{shown} of {_kinds_of(belt.friction, name)}"
@@ -190,6 +186,26 @@ class Question:
             identity["observe"] = f"{kind} {fingerprint(self.observe, 'observe')}"
         identity["derivatives"] = repr(self.derivatives)
         return identity
+
+    @functools.cached_property
+    def _made(self) -> str:
+        """Hash of the starts and parameters of the runs, by numbers that do not depend on the
+        machine: eleven digits of `SAMPLE` runs, and single precision of `MOST_COUNTED`.
+
+        More digits of so many runs would depend on it: a few lie where two machines round apart.
+        """
+        grid = self.grid
+        sample = np.unique(np.linspace(0, grid.runs - 1, SAMPLE).astype(int))
+        varying = " ".join(str(number) for number, varies in enumerate(grid.mapped) if varies)
+        numbers = " ".join(f"{x:.10e}" for x in grid.rows(sample).ravel().tolist())
+        found = hashlib.sha256(f"{varying}: {numbers}".encode())
+        counted = min(grid.runs, MOST_COUNTED)
+        for first in range(0, counted if grid.runs > SAMPLE else 0, SAMPLE):
+            runs = np.arange(first, min(first + SAMPLE, counted)) * grid.runs // counted
+            rows = grid.rows(runs)
+            with np.errstate(over="ignore"):
+                found.update(np.where(np.isnan(rows), np.nan, rows).astype("<f4").tobytes())
+        return found.hexdigest()[:16]
 
 
 def quantities_of(dataset: "xarray.Dataset") -> dict[str, str]:

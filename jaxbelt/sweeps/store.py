@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     import xarray
 
 #: Version of the layout described above.
-SCHEMA = 3
+SCHEMA = 4
 #: Largest number of runs in a block: few enough that not much is lost with one.
 BLOCK_RUNS = 2**17
 #: Number of blocks of a smaller sweep, whose runs may be long (writing a block takes some 40 ms),
