@@ -221,11 +221,18 @@ def test_a_sweep_is_explained_without_doing_it(monkeypatch):
     monkeypatch.setattr(store, "BLOCK_RUNS", 4)
     found = jb.explain(jb.presets.class_b, AXES, t1=SPAN)
     assert (found.runs, found.blocks) == (8, 2) and found.seconds > 0
-    swept = final(AXES)
-    assert found.bytes == swept.nbytes - swept.belt.nbytes
+    assert found.bytes == final(AXES).nbytes
     assert "8 runs in 2 blocks" in repr(found)
     with pytest.raises(ValueError, match="t1 must be given"):
         jb.explain(jb.presets.class_b, AXES)
+
+
+@pytest.mark.slow(first=True)
+def test_a_dataset_of_attractors_is_as_large_as_explained():
+    """Its signatures are numbered, in fewer bytes than the codes that runs hand in."""
+    options = dict(observe="attractor", derivatives="nu0")
+    found = jb.explain(jb.presets.class_b, AXES, **options)
+    assert found.bytes == jb.sweep(jb.presets.class_b, AXES, **options).nbytes
 
 
 def test_progress_is_shown_where_it_is_wanted(capsys):

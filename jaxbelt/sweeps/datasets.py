@@ -4,6 +4,7 @@ A category is an integer; its meaning is in the attributes `flag_values` and `fl
 CF conventions, and `decoded` puts the words in its place.
 """
 
+import math
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -213,6 +214,16 @@ class Table:
     def numbered(self) -> list[str]:
         """Variables whose categories are numbered when all runs are known."""
         return [name for name in self.shapes if self.variable(name).name_of is not None]
+
+    @property
+    def nbytes(self) -> int:
+        """Size of the dataset in memory, in bytes."""
+        numbered, width = self.numbered(), 0
+        for name, shape in self.shapes.items():
+            dtype = NUMBERED if name in numbered else self.variable(name).dtype
+            width += math.prod(shape) * np.dtype(dtype).itemsize
+        coordinates = self.coordinates().values()
+        return self.grid.runs * width + sum(values.nbytes for _, values, _ in coordinates)
 
     def numbering(self, name: str, codes: Iterable[int]) -> tuple[dict[int, int], dict[str, Any]]:
         """Numbers of the categories with these codes, and the attributes that name them."""
