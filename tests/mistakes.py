@@ -74,6 +74,8 @@ MISTAKES = [
         r"word of Worded must be a number .* equinox.field\(static=True\), got 'soft'",
     ),
     ("jb.PhysicalBelt(0.3, Worded(1.0, nu0), 1.0)", "word of Worded .* got the func"),
+    ("jb.Belt(0.3, Worded(None, 1.0))", "static of Worded must be a number or an array.* got None"),
+    ("jb.Belt(0.3, FadingLaw(1.0))", "mu of FadingLaw must be .* where rate is None, .*TypeError"),
     ("jb.Belt(0.3, NumpyLaw())", "mu of NumpyLaw must be .* JAX can trace .*not .*np.sqrt"),
     ("jb.Belt(0.3, BranchingLaw())", "mu of BranchingLaw must be .* JAX can trace .* or if"),
     ("jb.Belt(0.3)", "missing 1 required positional argument: 'friction'"),
@@ -491,6 +493,26 @@ MISTAKES = [
         r"observe.finish must be .* by their names, got \[1\]",
     ),
     (
+        "jb.sweep(keyed('nu'), {'nu': row}, t1=9.0, observe=Made(init=lambda osc, a, b: 0))",
+        "observe.update must be .* types that init returns, got float64 where init returns int64",
+    ),
+    (
+        "jb.sweep(keyed('nu'), {'nu': row}, t1=9.0, observe=Made(rates=lambda o, m: m.forces))",
+        r"observe.rates must be .* of numbers, got an array of float64 of shape \(1,\)",
+    ),
+    (
+        "jb.sweep(keyed('nu'), {'nu': row}, t1=9.0, observe=Made(finish=lambda s, e: {'z': 1j}))",
+        "observe.finish must be .* real results, got complex numbers for z",
+    ),
+    (
+        "jb.sweep(keyed('nu'), {'nu': row}, t1=9.0, observe=Made(finish=lambda s, e: {'z': None}))",
+        "observe.finish must be .* numbers, or vectors, by their names, got .* for z",
+    ),
+    (
+        "jb.sweep(keyed('nu'), {'nu': row}, t1=9.0, observe=Made(finish=lambda s, e: {'z': {}}))",
+        "observe.finish must be .* numbers, or vectors, by their names, got a dict .* for z",
+    ),
+    (
         "jb.sweep(jb.presets.class_b, AXES, t1=9.0, observe=Sectioned())",
         "function of AtSection must be .* returns one number, got an array of bool",
     ),
@@ -722,6 +744,16 @@ MISTAKES = [
 # --- what the calls above are about ---------------------------------------------------------------
 
 
+class FadingLaw(jb.AbstractFriction):
+    """A law with a number that has to be given."""
+
+    static: jax.Array
+    rate: Any = None
+
+    def mu(self, speed):
+        return self.static / (1 + self.rate * speed)
+
+
 class Worded(jb.AbstractFriction):
     """A law whose field is neither a number nor static."""
 
@@ -786,6 +818,19 @@ class Named(Reducer):
 
     def finish(self, state, end):
         return {self.name: state}
+
+
+class Made(Reducer):
+    """A sum of x1 with other methods."""
+
+    def __init__(self, **methods):
+        self.__dict__.update(methods)
+
+    def update(self, state, event):
+        return state + event.x1
+
+    def finish(self, state, end):
+        return {"sum": state}
 
 
 class Sectioned(Reducer):

@@ -319,6 +319,34 @@ def test_rest_and_a_mass_that_is_stuck_for_ever_are_integrated():
     np.testing.assert_allclose(held.rms, 0.25, rtol=1e-15)
 
 
+class Counted:
+    """Rates that are no floats, and a state that becomes one."""
+
+    def init(self, osc, x1, x2):
+        return 0.0
+
+    def rates(self, osc, motion):
+        return {"time": 1, "right": motion.x1 > 0}
+
+    def update(self, state, event):
+        return 1  # kept as a float
+
+    def finish(self, state, end):
+        return end.integrals | {"state": state}
+
+
+@pytest.mark.slow(first=True)
+def test_rates_that_are_integers_or_truth_values_are_integrated():
+    make, axes = FAST
+    options = dict(y0=(0.25, 0.0), t1=3.0, progress=False, observe=Counted())
+    held = jb.sweep(jb.presets.class_a, {"nu0": [0.0]}, **options)
+    np.testing.assert_allclose([held.time, held.right], 3.0, rtol=1e-14)
+    moving = jb.sweep(make, axes, **options)
+    np.testing.assert_allclose(moving.time, 3.0, rtol=1e-14)
+    # A jump of a rate within a step is found to the size of the step.
+    assert np.all((moving.right > 0) & (moving.right <= 3.0))
+
+
 @pytest.mark.slow(first=True)
 def test_a_store_knows_moments_apart(tmp_path):
     def count(moment):

@@ -97,8 +97,9 @@ def _is_at_most(value: Any, _: Any, most: Any) -> Any:
     return value <= most
 
 
-#: Users' laws whose `mu` was traced, and those that were searched for kinks.
-_traced: set[type] = set()
+#: Users' laws whose `mu` was traced, with the fields that were None; and those that were searched
+#: for kinks.
+_traced: set[tuple[Any, ...]] = set()
 _asked_of_kinks: set[type] = set()
 
 
@@ -106,28 +107,33 @@ def check_law(law: AbstractFriction) -> None:
     """Raises a `ValueError` if a user's law cannot be used.
 
     That is if a field is neither a number nor static, or if its `mu` cannot be traced, the latter
-    once for each class. A law that calls NumPy's exponential returns right numbers alone and fails
-    inside compiled programs.
+    once for each class and set of fields that are None. A law that calls NumPy's exponential
+    returns right numbers alone and fails inside compiled programs.
     """
     kind = type(law)
     if kind.__module__ == __name__:
         return
-    for path, leaf in jax.tree_util.tree_flatten_with_path(law)[0]:
+    absent = []
+    for path, leaf in jax.tree.leaves_with_path(law, is_leaf=lambda leaf: leaf is None):
         name = jax.tree_util.keystr(path).lstrip(".")
+        if leaf is None and name != "static":
+            absent.append(name)
+            continue
         expected = "a number or an array, or declared as equinox.field(static=True)"
         is_number = isinstance(leaf, jax.Array | np.ndarray | np.generic | float | int)
         require_value(is_number, f"{name} of {kind.__name__}", expected, leaf)
-    if kind in _traced:
+    if (kind, *absent) in _traced:
         return
     speed = jax.ShapeDtypeStruct((), jnp.float64)
 
     def coefficients() -> Any:
         return jax.eval_shape(law.mu, speed)
 
-    found = traceable(coefficients, f"mu of {kind.__name__}", "a function of the speed")
+    where = f" where {' and '.join(absent)} is None" if absent else ""
+    found = traceable(coefficients, f"mu of {kind.__name__}", f"a function of the speed{where}")
     expected = "a function that returns one float64 a speed"
     require_one_float(found, f"mu of {kind.__name__}", expected)
-    _traced.add(kind)
+    _traced.add((kind, *absent))
 
 
 def _warn_of_kink(law: AbstractFriction) -> None:

@@ -68,6 +68,16 @@ class Motion(eqx.Module):
     forces: Array
 
 
+def rates_of(reducer: Any, osc: Oscillator, motion: Motion) -> Any:
+    """The rates of a reducer; integers and truth values become floats, as their integrals are."""
+
+    def integrand(rate):
+        rate = jnp.asarray(rate)
+        return rate if jnp.iscomplexobj(rate) else rate.astype(motion.x1.dtype)
+
+    return jax.tree.map(integrand, reducer.rates(osc, motion))
+
+
 class _Watched(eqx.Module):
     """Memory of the runs, arrays [lanes].
 
@@ -116,7 +126,7 @@ class Along(Observer):
         forces = jnp.stack([length * f for f in _forces(now, mode, x2, residual)], axis=-1)
 
         def rates(osc, x1, x2, *rest):
-            return self.reducer.rates(osc, Motion(rest[0], x1, x2, *rest[1:]))
+            return rates_of(self.reducer, osc, Motion(rest[0], x1, x2, *rest[1:]))
 
         return as_given(rates, osc, x1, x2, t, a, forces)
 

@@ -429,6 +429,11 @@ def _layout(program: Program, shared: tuple[Any, ...]) -> dict[str, tuple[int, .
     shapes = {}
     for name in _ordered(values):
         value = values[name]
+        if any(jnp.issubdtype(part.dtype, jnp.complexfloating) for part in jax.tree.leaves(value)):
+            raise TypeError(
+                f"observe.finish must be a method that returns real results, got complex numbers "
+                f"for {name}; let their real and their imaginary part be two results"
+            )
         is_tuple = isinstance(value, tuple)
         shapes[name] = (len(value),) if is_tuple else value.shape[1:]
     return shapes

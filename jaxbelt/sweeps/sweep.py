@@ -93,8 +93,8 @@ def sweep(
       parts of these, n_events.
     - an object with three methods for scalars: `init(osc, x1, x2)` returns the state of a run, any
       tree of arrays; `update(state, event)` the state after an `observers.RunEvent` (t, x1, x2,
-      kind, belt); `finish(state, end)` a dictionary of results, numbers or vectors, from the state
-      and an `observers.RunEnd` (t, x1, x2, status). They are traced, so use `jax.numpy`. With the
+      kind, belt), of the same shapes and types; `finish(state, end)` a dictionary of results, real
+      numbers or vectors, from the state and an `observers.RunEnd` (t, x1, x2, status). They are traced, so use `jax.numpy`. With the
       attribute `at`, a tuple of the moments `AtEvents()`, `AtExtrema("x1")`, `AtSection(function)`,
       `AtTimes(times)` and, with forcing, `AtPhase(phase)`, `update` is called at these; with a
       method `rates(osc, motion)`, which returns a tree of numbers, their integrals are in
@@ -116,7 +116,12 @@ def sweep(
         observe: What to observe: `"final"`, `"attractor"` or an object, see above.
         derivatives: Names of axes. Each adds `d_<variable>_d_<axis>` for every variable that is a
             float, by forward mode; NaN where the variable is not finite.
-        store: Folder for the results, a Zarr group that `xarray.open_zarr` opens.
+        store: Folder for the results, a Zarr group that `xarray.open_zarr` opens. It is of another
+            sweep where an argument from `make` to `derivatives` differs. `make` counts by the
+            oscillators that it returns: by their laws and forces, and by their numbers, at 16,384
+            points of the grid to eleven digits and at all points to seven (at 16,777,216 points,
+            evenly spaced, of a larger grid). An observable, law or force of one's own counts by its
+            code and by what that reads.
         executor: A `dask.distributed.Client`, whose workers do the blocks of the store, in a folder
             that all of them see. A worker that dies costs the block that it was doing.
         blocks: (first, last): the blocks of the store to do, `last` not among them, for processes
@@ -134,6 +139,7 @@ def sweep(
     Raises:
         ValueError: If an argument is impossible, or the store is of another sweep; the message
             names it.
+        TypeError: If a method of `observe` returns what is of a wrong type; likewise.
         KeyboardInterrupt: Within a second of an interrupt; the message says what became of the
             runs.
         OSError: If the store cannot be written; likewise.
@@ -336,7 +342,7 @@ def explain(
         ValueError: If an argument is impossible; the message names it.
     """
     question = Question.of(make, axes, y0, t1, rtol, atol, observe, derivatives, t0)
-    grid, table = question.grid, question.table
+    grid = question.grid
     sample = np.unique(np.linspace(0, grid.runs - 1, CHUNK.here).astype(int))
 
     def rows_of(first: int, last: int) -> np.ndarray:
@@ -356,14 +362,10 @@ def explain(
         return time.monotonic() - began
 
     compiling, seconds = timed(1), timed(len(sample))
-    widths = [
-        int(np.prod(shape, dtype=int)) * np.dtype(table.variable(name).dtype).itemsize
-        for name, shape in table.shapes.items()
-    ]
     return Explanation(
         runs=grid.runs,
         blocks=len(blocks_of(grid)),
-        bytes=grid.runs * sum(widths) + sum(axis.nbytes for axis in grid.axes.values()),
+        bytes=question.table.nbytes,
         compile_seconds=compiling,
         seconds=seconds * grid.runs / len(sample),
     )
