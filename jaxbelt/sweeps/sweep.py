@@ -94,11 +94,12 @@ def sweep(
     - an object with three methods for scalars: `init(osc, x1, x2)` returns the state of a run, any
       tree of arrays; `update(state, event)` the state after an `observers.RunEvent` (t, x1, x2,
       kind, belt), of the same shapes and types; `finish(state, end)` a dictionary of results, real
-      numbers or vectors, from the state and an `observers.RunEnd` (t, x1, x2, status). They are traced, so use `jax.numpy`. With the
-      attribute `at`, a tuple of the moments `AtEvents()`, `AtExtrema("x1")`, `AtSection(function)`,
-      `AtTimes(times)` and, with forcing, `AtPhase(phase)`, `update` is called at these; with a
-      method `rates(osc, motion)`, which returns a tree of numbers, their integrals are in
-      event.integrals and end.integrals, see `along.Motion`.
+      numbers or vectors, from the state and an `observers.RunEnd` (t, x1, x2, status). They are
+      traced, so use `jax.numpy`. With the attribute `at`, a tuple of the moments `AtEvents()`,
+      `AtExtrema("x1")`, `AtSection(function)`, `AtTimes(times)` and, with forcing,
+      `AtPhase(phase)`, `update` is called at these; with a method `rates(osc, motion)`, which
+      returns a tree of numbers, their integrals are in event.integrals and end.integrals, see
+      `along.Motion`.
     - a `lanes.Observer`, the base class of the first two.
 
     Args:
