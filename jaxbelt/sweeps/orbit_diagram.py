@@ -319,7 +319,10 @@ class Sampling:
             *state, last = reducer.last_state(found)
             passed[following] = (passed[which] + left_out + last) % turns[following]
             times = (self.at.phase / (2 * np.pi) + passed[following]) * period[following]
-            rests, away = _at_rest(found), np.where(found["status"] == Status.STUCK_FOREVER, 0, off)
+            rests, away = (
+                _have_come_to_rest(found),
+                np.where(found["status"] == Status.STUCK_FOREVER, 0, off),
+            )
             ends = (np.where(rests, found[at], x) for at, x in zip(ENDS_AT, state, strict=True))
             return np.stack([*(x + away for x in ends), times])
 
@@ -333,7 +336,7 @@ class Sampling:
         kind = np.where(status == Status.OK, kind, KINDS[UNDECIDED])
         for at_rest, code in RESTS.items():
             kind[status == at_rest] = KINDS[code]
-        rests = _at_rest(found)
+        rests = _have_come_to_rest(found)
         x1[rests, 0], x2[rests, 0] = (found[at][rests] for at in ENDS_AT)
         once = (turns[:, None] > 0) & (np.arange(STROBES) >= turns[:, None])
         x1, x2 = (np.where(once, np.nan, x) for x in (x1, x2))
@@ -464,7 +467,7 @@ def _beside_attractor(grid: Grid) -> Callable[..., np.ndarray]:
     return state
 
 
-def _at_rest(found: dict[str, np.ndarray]) -> np.ndarray:
+def _have_come_to_rest(found: dict[str, np.ndarray]) -> np.ndarray:
     """Which forced runs have come to rest, by their results."""
     return np.isin(found["status"], list(RESTS))
 

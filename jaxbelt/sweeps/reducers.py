@@ -42,7 +42,9 @@ def check_reducer(reducer: Any, osc: Oscillator) -> None:
     same = jax.tree.map(jnp.shape, new) == jax.tree.map(jnp.shape, state)
     came = f"{shape_in_words(new)} where init returns {shape_in_words(state)}"
     require(same, "observe.update", "a method that returns a state such as init does", came)
-    kept = _tried("update", "(state, event)", functools.partial(jax.tree.map, _chosen), new, state)
+    kept = _tried(
+        "update", "(state, event)", functools.partial(jax.tree.map, _number_kept), new, state
+    )
     for after, before in zip(*map(jax.tree.leaves, (kept, state)), strict=True):
         expected = "a method that returns numbers of the types that init returns"
         came = f"{after.dtype} where init returns {before.dtype}"
@@ -64,7 +66,7 @@ def check_reducer(reducer: Any, osc: Oscillator) -> None:
         _require_type(fits, "observe.finish", expected, f"{shape_in_words(value)} for {name}")
 
 
-def _chosen(new: Any, old: Any) -> Any:
+def _number_kept(new: Any, old: Any) -> Any:
     """A number of a state, in the type in which `lanes.choose` keeps it."""
     return jnp.where(True, new, old)
 
