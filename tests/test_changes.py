@@ -104,3 +104,42 @@ def test_a_curve_of_corners_goes_on_where_its_cycle_touches_an_edge():
     beyond = values[values[:, 0] > 0.4]
     beyond = beyond[np.argsort(beyond[:, 1])]
     assert np.interp(0.3, beyond[:, 1], beyond[:, 0]) == pytest.approx(corner, abs=1e-4)
+
+
+@pytest.mark.parametrize("step", [0.5, 0.1])
+def test_a_curve_at_infinity_goes_on_until_nothing_rubs(step):
+    """zeta = -2/pi p2 u0 for a contact interval of length 1, down to the load 0."""
+    law = jb.Conti(1.0, 0.6, 10.0, 0.3)
+
+    def make(damping, load=1.0):
+        return jb.Oscillator(damping, (jb.Belt(0.3, law, load=load, lower=-0.5, upper=0.5),))
+
+    point = jb.refine(jb.HopfAtInfinity(), make, at=-0.1)
+    expected = np.array([2.0, 0.0])
+    for least, end in ((0.0, Stop.LEFT_SPAN), (-1.0, Stop.STOPPED)):
+        curve = jb.bifurcation_curve(point, make, ((-1.0, 1.0), (least, 2.0)), step=step)
+        assert curve.ends == (Stop.LEFT_SPAN, end) and curve.special == ()
+        assert curve.values[[0, -1], 1] == pytest.approx(expected, abs=1e-12)
+        slope = -0.6 / np.pi
+        # The growth of mu is that of its values at speeds of 1e8.
+        np.testing.assert_allclose(curve.values[:, 0], slope * curve.values[:, 1], atol=1e-9)
+
+
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("step", [0.1, 0.03])
+def test_a_curve_of_pseudo_foci_has_a_row_at_its_ends_and_all_special_points(step):
+    """From the Hopf point of belt 1 alone on the edge of belt 0 to that of both belts."""
+    law = jb.presets.paper_friction()
+
+    def make(upper, velocity):
+        belts = jb.Belt(0.35, law, upper=upper), jb.Belt(velocity, law, lower=0.1)
+        return jb.Oscillator(0.5, belts)
+
+    point = jb.refine(jb.PseudoHopf(0), lambda upper: make(upper, 0.25), at=1.4)
+    curve = jb.bifurcation_curve(point, make, ((-2.0, 2.5), (-1.0, 1.0)), step=step)
+    kinds = [one.kind for one in curve.special]
+    assert kinds == ["BoundaryHopf", "DegeneratePseudoHopf", "BoundaryHopf"]
+    alone, both = (np.sqrt(8) - 1) / 10, (np.sqrt(4 / (0.5 - 4 / 4.5**2)) - 1) / 10
+    pull = 0.6 + 0.4 / (1 + 10 * np.array([alone, both]))
+    expected = [(pull[0], alone), (0.6 + 0.4 / 4.5 + pull[1], both)]
+    np.testing.assert_allclose(curve.values[[0, -1]], expected, rtol=0, atol=1e-12)

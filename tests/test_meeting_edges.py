@@ -253,3 +253,87 @@ def test_edges_of_a_split_belt_meet_another_one(way):
     for half in (0, 1):
         point = jb.refine(jb.MeetingEdges((half, 2)), make, at=0.01)
         assert point.status == jb.Status.OK and abs(float(point.value)) < 1e-12
+
+
+def curve_ends(of, make, span, step):
+    """Ends of a curve in its rows, how it ends there, and its special points."""
+    curve = jb.bifurcation_curve(of, make, span, step=step)
+    assert np.max(curve.residual) < 1e-12
+    # An end with a name is the special point itself, in the order of the path, too.
+    named = [curve.is_named(end) for end in (0, -1)]
+    values = [special.values for special in curve.special]
+    assert all(tuple(curve.values[end]) in values for end in (0, -1) if named[end])
+    return curve.values[[0, -1]], curve.ends, [one.kind for one in curve.special], named
+
+
+def touching(upper, other=0.75, velocity=0.35, load=1.0):
+    """Both belts to the left of their edges."""
+    belts = jb.Belt(velocity, LAW, upper=upper), jb.Belt(0.6, LAW, load=load, upper=other)
+    return jb.Oscillator(0.5, belts)
+
+
+@pytest.mark.parametrize("step", [0.5, 0.1, 0.03])
+def test_a_curve_ends_where_the_mass_ceases_to_rest_at_the_edges(step):
+    """Between where nothing pushes from the right, at 0, and where both belts pull no farther."""
+    point = jb.refine(MEETING, touching, at=0.76)
+    expected = np.array([[0.0, 0.0], [1.0, 1.0]]) * (1.2 + 0.4 / 4.5 + 0.4 / 7.0)
+    for unit, way in ((1.0, 1), (1e3, 1), (1.0, -1)):
+
+        def make(p, q, unit=unit, way=way):
+            return touching(*(value / unit for value in (p, q)[::way]))
+
+        span = ((-3 * unit, 3 * unit),) * 2
+        values, ends, special, named = curve_ends(point, make, span, step)
+        assert ends == (Stop.STOPPED, Stop.STOPPED) and named == [True, True]
+        assert special == ["BoundaryEquilibrium"] * 2
+        np.testing.assert_allclose(values, unit * expected, rtol=0, atol=1e-12 * unit)
+
+
+def test_a_curve_may_begin_at_its_end():
+    def make(upper, lower):
+        return beside(upper, lower, nu=(0.35, 0.6))
+
+    point = jb.refine(MEETING, lambda upper: make(upper, 0.0), at=0.01)
+    assert point.status == Status.OK and point.value == 0
+    values, _, special, named = curve_ends(point, make, ((-3.0, 3.0), (-3.0, 3.0)), 0.1)
+    assert special == ["BoundaryEquilibrium"] * 2 and named == [True, True]
+    np.testing.assert_allclose(values[0], 0, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "span", "kinds", "end"),
+    [
+        # The pull of belt 0 is less than the spring's, the rest is that of the load.
+        ("load", (0.0, 3.0), ["BoundaryEquilibrium"], (0.15 - 0.4 / 4.5) / (0.6 + 0.4 / 7.0)),
+        # Belt 0 pulls to the other side where it turns round.
+        ("velocity", (-1.0, 3.0), ["BeltAtRest", "EqualVelocities"], 0.0),
+    ],
+)
+def test_a_curve_ends_where_a_belt_pulls_no_more(name, span, kinds, end):
+    def make(upper, value):
+        return touching(upper, **{name: value})
+
+    point = jb.refine(MEETING, touching, at=0.76)
+    for step in (0.2, 0.03):
+        around = ((0.5, 1.0), span)
+        at = {"load": (0.75, 1.0), "velocity": (0.75, 0.35)}[name]
+        curve = jb.bifurcation_curve(point, make, around, at=at, step=step)
+        assert curve.ends == (Stop.STOPPED, Stop.LEFT_SPAN)
+        assert [one.kind for one in curve.special] == kinds and curve.is_named(0)
+        assert curve.values[0] == pytest.approx((0.75, end), abs=1e-12)
+
+
+@pytest.mark.parametrize(("side", "first", "last"), [("upper", -1.0, 1.0), ("lower", -0.3, 1.7)])
+def test_a_curve_ends_where_a_belt_at_rest_holds_no_more(side, first, last):
+    """Belt 0 at rest holds 1, between the edges alone or with belt 1, which pulls with 0.7."""
+
+    def make(upper, other):
+        belts = jb.Belt(0.0, LAW, upper=upper), jb.Belt(0.3, LAW, **{side: other})
+        return jb.Oscillator(0.5, belts)
+
+    point = jb.refine(MEETING, lambda upper: make(upper, 0.5), at=0.52)
+    for step in (0.2, 0.05):
+        found = curve_ends(point, make, ((-3.0, 3.0), (-3.0, 3.0)), step)
+        values, _, special, named = found
+        assert special == ["BoundaryEquilibrium"] * 2 and named == [True, True]
+        np.testing.assert_allclose(values, [[first] * 2, [last] * 2], rtol=0, atol=1e-12)

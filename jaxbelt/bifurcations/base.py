@@ -96,7 +96,7 @@ class AbstractCondition(eqx.Module):
     has_several: ClassVar[bool] = False
     #: Whether branches of a diagram go on through a point.
     joins: ClassVar[bool] = True
-    #: Whether its curve ends where the signature changes.
+    #: Whether its curve ends where the signature changes, or such a state of rest ceases to exist.
     ends_at_contact: ClassVar[bool] = False
     #: Whether its curve bends sharply before its limit, so that rows are needed close to that.
     bends: ClassVar[bool] = False

@@ -1,4 +1,5 @@
-"""How a curve of bifurcation points goes on where the signature changes: `beyond_change`."""
+"""Where the motion of a curve of bifurcation points ceases to exist: `where_it_ends`; and how the
+curve goes on where only its signature changes: `beyond_change`."""
 
 import itertools
 from collections.abc import Iterator
@@ -8,9 +9,11 @@ import numpy as np
 
 from ..model.oscillator import has_clock
 from ..model.variations import Variation
+from ..numerics.continuation import CurvePoint
 from .base import AbstractCondition, BifurcationPoint
 from .refine import points_within
 from .special import FAR, SpecialPoint, is_elsewhere
+from .systems import RestSystem, Seen
 from .tracks import Track
 
 #: How far from a change of signature the curve is searched for, in steps: it may bend sharply, or
@@ -19,6 +22,13 @@ BESIDE_CHANGE = (0.5, 0.1, 0.02)
 #: What is no farther from the chords between rows is on the curve, in steps: neighbouring tangents
 #: differ by 18 degrees at most.
 ON_CHORD = 0.05
+#: Where no step is short enough, a point of codimension two this near is in the way, in steps.
+JUST_AHEAD = 0.02
+#: How often the step in which the motion ceases to exist is halved to find where; for a state of
+#: rest, which costs no integration, to rounding.
+HALVINGS_TO_END, HALVINGS_TO_END_OF_REST = 10, 50
+#: How well a point is found again, with other arcs.
+SAME_POINT_AGAIN = 1e-8
 
 
 class CurveProblem(NamedTuple):
@@ -45,6 +55,40 @@ class CurveRow(NamedTuple):
     multiplier: float
     residual: float
     place: np.ndarray
+
+
+def where_it_ends(track: Track, last: CurvePoint, beyond: CurvePoint) -> tuple[np.ndarray, float]:
+    """The unknowns where the motion just exists, between the last point and one beyond, where its
+    equations may have turned back; and how far from there it does not."""
+    length, known, ends = float((beyond.u - last.u) @ last.tangent), 0.0, 1.0
+    of_rest = isinstance(track.system, RestSystem)
+    for _ in range(HALVINGS_TO_END_OF_REST if of_rest else HALVINGS_TO_END):
+        part = 0.5 * (known + ends)
+        at = track.corrected(last.u, last.tangent, part * length)
+        exists = at.found and track.seen_at(at.u).exists
+        known, ends = (part, ends) if exists else (known, part)
+    return track.corrected(last.u, last.tangent, known * length).u, (ends - known) * length
+
+
+def just_ahead(seen: list[tuple[CurvePoint, Seen]], step: float) -> list[SpecialPoint]:
+    """The point of codimension two just ahead of the last of two points, where a line through the
+    values of a watched function vanishes; its residual is its distance from the last point.
+
+    Where an arc begins or ends on an edge its duration goes like a square root, so no step leads
+    there.
+    """
+    if len(seen) < 2:
+        return []
+    (before, was), (last, now) = seen
+    found = []
+    for name, value in now.tests.items():
+        change = was.tests.get(name, np.nan) - value
+        part = value / change if change else np.inf
+        away = part * np.linalg.norm((last.u - before.u)[-2:])
+        if 0 < part and away < JUST_AHEAD * step:
+            at = last.u[-2:] + part * (last.u - before.u)[-2:]
+            found.append(SpecialPoint(*name, (float(at[0]), float(at[1])), float(away)))
+    return sorted(found, key=lambda point: point.residual)[:1]
 
 
 def beyond_change(
@@ -84,8 +128,9 @@ def _near_change(
             yield condition.named_point_beside(held, near + offset * reach, *known)
 
     def searched(held: Variation, near: float) -> Iterator[BifurcationPoint | None]:
-        # Where the motion is there only just beside the curve, guesses miss it.
-        if not has_clock(known[0]):
+        # Where the motion is there only just beside the curve, guesses miss it; those of a state of
+        # rest are all there are.
+        if not has_clock(known[0]) and not isinstance(track.system, RestSystem):
             yield from points_within(condition, held, near, 2 * reach)
 
     found: list[tuple[float, BifurcationPoint, np.ndarray]] = []

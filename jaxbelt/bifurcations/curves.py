@@ -32,10 +32,18 @@ from ..model.own_units import own_length, quantity, rescaled
 from ..model.parameters import leaf_index
 from ..model.variations import Variation
 from ..numerics.continuation import CurvePoint, Stop, continue_curve
+from ..numerics.newton import HOLDS
 from ..results import Status, draw
 from ..tables import table_of
 from .base import AbstractCondition, BifurcationPoint
-from .changes import CurveProblem, CurveRow, beyond_change
+from .changes import (
+    SAME_POINT_AGAIN,
+    CurveProblem,
+    CurveRow,
+    beyond_change,
+    just_ahead,
+    where_it_ends,
+)
 from .forced import AbstractForcedCondition, UnitCircle
 from .forced_ends import border_at, meeting_point
 from .special import (
@@ -47,7 +55,7 @@ from .special import (
     where_belts_stop,
     where_edge_is_touched,
 )
-from .systems import Seen
+from .systems import RestSystem, Seen
 from .tracks import Track, special_between
 
 if TYPE_CHECKING:
@@ -56,12 +64,6 @@ if TYPE_CHECKING:
 #: Steps are shortened to this fraction before a curve ends because none is short enough: a curve of
 #: nonsmooth folds has a turning point with a radius of a hundredth of a step.
 SHORTEST_PART = 1e-3
-#: Where no step is short enough, a point of codimension two this near is in the way, in steps.
-JUST_AHEAD = 0.02
-#: How often the step in which the motion ceases to exist is halved to find where.
-HALVINGS_TO_END = 10
-#: How well a point is found again, with other arcs.
-SAME_POINT_AGAIN = 1e-8
 #: Number of points after which the integration steps are distributed anew.
 REMESH = 10
 
@@ -147,8 +149,9 @@ class BifurcationCurve(eqx.Module):
             ends = [np.hypot(*(path[i] - at)) for i in (0, -1)]
             gaps = np.hypot(*(path[1:] - path[:-1]).T)
             detour = np.hypot(*(path[:-1] - at).T) + np.hypot(*(path[1:] - at).T) - gaps
-            # At an end, where that is nearer than the detour between two rows.
-            place = int(np.argmin([ends[0], *detour, ends[1]]))
+            # At an end, where that is nearer than the detour between two rows, or a row itself.
+            places = [ends[0], *np.maximum(detour, 0), ends[1]]
+            place = int(np.argmin(places)) if ends[1] else len(path)
             path = np.insert(path, place, at, axis=0)
             order.insert(place, point)
         return order
@@ -345,7 +348,8 @@ def _side(
         leg = _leg(problem, track, u, direction, home, most)
         points, beyond, end = leg.points, leg.beyond, leg.end
         rows += [_row_at(problem, track, at.u, seen) for at, seen in points[min(len(rows), 1) :]]
-        special += [*leg.special, *leg.at_change]
+        passed = [*special, *leg.special]
+        special = [*passed, *leg.at_change]
         seen_last = [*seen_last, *points[min(len(seen_last), 1) :]][-2:]
         last = points[-1][0].u if points else u
         if not rows:
@@ -366,7 +370,7 @@ def _side(
             # What is watched with forcing does not change the signature; the curve of a multiplier
             # ends where the signature does.
             is_forced = isinstance(problem.condition, AbstractForcedCondition)
-            changes = [] if is_forced else _just_ahead(seen_last, problem.step)
+            changes = [] if is_forced else just_ahead(seen_last, problem.step)
             special += changes
             goes_on = is_forced and not isinstance(problem.condition, UnitCircle) and points
             if not changes and not (goes_on and meeting_point(problem.condition, trail) is None):
@@ -380,12 +384,16 @@ def _side(
             track, u, direction = begun or track.remeshed(last, at.tangent)
             continue
         # The signature changes here, or between the last two points.
-        centre, error = last[-2:], SHORTEST_PART * problem.step
+        known, error = last, SHORTEST_PART * problem.step
         if beyond is not None:
-            centre, error = _where_it_ends(track, points[-1][0], beyond)
-        centre = np.array(changes[-1].values) if changes else centre
-        is_end = bool(changes) and problem.condition.ends_at_contact
+            known, error = where_it_ends(track, points[-1][0], beyond)
+        centre = np.array(changes[-1].values) if changes else known[-2:]
+        rests = isinstance(track.system, RestSystem)
+        is_end = problem.condition.ends_at_contact and (bool(changes) or rests)
         further = None if is_end else beyond_change(problem, track, rows, last, centre)
+        if further is None and rests and beyond is not None:
+            step = points[-1], beyond
+            return _rest_ended(problem, track, rows, passed, trail, step, known)
         if further is None:
             return _ended(problem, rows, special, trail)
         special += [] if changes else border_at(problem.condition, trail, centre, error)
@@ -416,39 +424,6 @@ def _begun_again(
     return new, u, direction * np.sign(direction[-2:] @ way)
 
 
-def _where_it_ends(track: Track, last: CurvePoint, beyond: CurvePoint) -> tuple[np.ndarray, float]:
-    """Both parameters where the motion ceases to exist, between the last point and one beyond,
-    where its equations may have turned back; and how well they are known."""
-    length, known, ends = float((beyond.u - last.u) @ last.tangent), 0.0, 1.0
-    for _ in range(HALVINGS_TO_END):
-        part = 0.5 * (known + ends)
-        at = track.corrected(last.u, last.tangent, part * length)
-        exists = at.found and track.seen_at(at.u).exists
-        known, ends = (part, ends) if exists else (known, part)
-    return track.corrected(last.u, last.tangent, known * length).u[-2:], (ends - known) * length
-
-
-def _just_ahead(seen: list[tuple[CurvePoint, Seen]], step: float) -> list[SpecialPoint]:
-    """The point of codimension two just ahead of the last of two points, where a line through the
-    values of a watched function vanishes; its residual is its distance from the last point.
-
-    Where an arc begins or ends on an edge its duration goes like a square root, so no step leads
-    there.
-    """
-    if len(seen) < 2:
-        return []
-    (before, was), (last, now) = seen
-    found = []
-    for name, value in now.tests.items():
-        change = was.tests.get(name, np.nan) - value
-        part = value / change if change else np.inf
-        away = part * np.linalg.norm((last.u - before.u)[-2:])
-        if 0 < part and away < JUST_AHEAD * step:
-            at = last.u[-2:] + part * (last.u - before.u)[-2:]
-            found.append(SpecialPoint(*name, (float(at[0]), float(at[1])), float(away)))
-    return sorted(found, key=lambda point: point.residual)[:1]
-
-
 def _ended(
     problem: CurveProblem, rows: list[CurveRow], special: list[SpecialPoint], trail: Trail
 ) -> _OneSide:
@@ -466,6 +441,41 @@ def _ended(
     apart = [np.hypot(*np.subtract(limit.values, one)) for one in known] if limit else [0.0]
     named = [] if min(apart, default=np.inf) < problem.step else [limit]
     return _OneSide(rows, [*special, *filter(None, named)], trail.end)
+
+
+def _rest_ended(
+    problem: CurveProblem,
+    track: Track,
+    rows: list[CurveRow],
+    special: list[SpecialPoint],
+    trail: Trail,
+    step: tuple[tuple[CurvePoint, Seen], CurvePoint],
+    u: np.ndarray,
+) -> _OneSide:
+    """The side of a curve of states of rest that ends at u, with a row there.
+
+    special: up to its last point; step: from that point to one where there is no such state.
+    """
+    last, beyond = step
+    end = beyond._replace(u=u), track.seen_at(u)
+    if beyond.end is Stop.LEFT_SPAN and _is_same_point(u, beyond.u):
+        trail = trail._replace(end=Stop.LEFT_SPAN)
+    # What is watched vanishes at the end without a change of sign.
+    tests, behind, pair = end[1].tests, track.seen_at(beyond.u).tests, (float(u[-2]), float(u[-1]))
+    at_end = {
+        name: SpecialPoint(*name, pair, abs(value))
+        for name, value in tests.items()
+        if abs(value) < HOLDS and not abs(behind[name]) < HOLDS
+    }
+    between = special_between(track, problem.limits, last, end)
+    special = [*special, *(one for one in between if (one.kind, one.belts) not in at_end)]
+    side = _ended(problem, rows, [*special, *at_end.values()], trail)
+    new = [] if _is_same_point(u, last[0].u) else [_row_at(problem, track, u, end[1])]
+    return side._replace(rows=[*rows, *new])
+
+
+def _is_same_point(u: np.ndarray, other: np.ndarray) -> bool:
+    return bool(np.linalg.norm((u - other)[-2:]) < SAME_POINT_AGAIN)
 
 
 def _end_at_rest(problem: CurveProblem, rows: list[CurveRow], near: float) -> SpecialPoint | None:

@@ -46,6 +46,7 @@ class HopfAtInfinity(AbstractRestCondition):
     caption: ClassVar[str] = "Hopf at infinity"
     line: ClassVar[Line] = Line("Hopf at infinity", "#009E73", (0, (1, 1.2)))
     no_cycle: ClassVar[Status] = Status.NOT_FINITE
+    ends_at_contact: ClassVar[bool] = True
 
     def guess(self, osc, size):
         return None

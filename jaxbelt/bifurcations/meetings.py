@@ -178,12 +178,23 @@ class EdgesAtRest(RestSystem):
 
     def exists(self, osc, x):
         """Whether the mass can rest on, or between, them in either order."""
+        focus, held = self._margins(osc)
+        rests = any_of([*(one > 0 for one in focus), *(one >= 0 for one in held)])
+        return rests & _both_rub(osc, self.belts)
+
+    def tests(self, osc, x):
+        focus, held = self._margins(osc)
+        return {("BoundaryEquilibrium", ()): jnp.max(jnp.stack([*focus, *held]))}
+
+    def _margins(self, osc: Oscillator) -> tuple[list[Array], list[Array]]:
+        """How hard the mass is pushed to a pseudo-focus on either edge, and how much more belts at
+        rest could hold between them, in both orders; negative where there is no such rest."""
         positions = jnp.stack(edges(osc))
         ends = jnp.sort(jnp.stack([positions[self.pair.first], positions[self.pair.second]]))
         rest = jnp.zeros(())
         left = contact(osc, ends[0], rest, rightward=False)
         right = contact(osc, ends[1], rest, rightward=True)
-        found = []
+        focus, held = [], []
         passed_first = (self.belts[0], self.pair.first), (self.belts[1], self.pair.second)
         for (passed, edge), (other, _) in zip(passed_first, reversed(passed_first), strict=True):
             # Between them the belt whose edge comes first has the contact that it has to the right
@@ -193,10 +204,11 @@ class EdgesAtRest(RestSystem):
                 jnp.where(equal[number] & (number != other), after, before)
                 for number, (before, after) in enumerate(zip(left.codes, right.codes, strict=True))
             ]
-            pushes = [_push(osc, mode, ends[0]) for mode in (left, Mode(tuple(codes)), right)]
-            focus = [(a > 0) & (b < 0) for a, b in pairwise(pushes)]
-            found += [*focus, pushes[1] == 0]
-        return any_of(found) & _both_rub(osc, self.belts)
+            modes = left, Mode(tuple(codes)), right
+            pushes = [_pushes(osc, mode, ends[0]) for mode in modes]
+            focus += [jnp.minimum(a, b) for (a, _), (_, b) in pairwise(pushes)]
+            held.append(-jnp.maximum(*pushes[1]))
+        return focus, held
 
 
 def _equal_belts(osc: Oscillator, belt: int | Array, edge: Array) -> list[Array]:
@@ -208,11 +220,10 @@ def _equal_belts(osc: Oscillator, belt: int | Array, edge: Array) -> list[Array]
     return [same[number] for number in range(n)]
 
 
-def _push(osc: Oscillator, mode: Mode, x1: Array) -> Array:
-    """Direction of the force at rest: the sign of x2', 0 where belts at rest hold the mass."""
-    needed = mode_acceleration(osc, mode, x1, jnp.zeros(()))
-    held = mode.any_stuck & (jnp.abs(needed) <= capacity(osc, mode))
-    return jnp.where(held, 0.0, jnp.sign(needed))
+def _pushes(osc: Oscillator, mode: Mode, x1: Array) -> tuple[Array, Array]:
+    """The forces on the mass at rest to the right and to the left, less what belts at rest hold."""
+    needed, held = mode_acceleration(osc, mode, x1, jnp.zeros(())), capacity(osc, mode)
+    return needed - held, -needed - held
 
 
 class MeetingEdges(AbstractRestCondition, _BetweenEdges):
@@ -226,6 +237,7 @@ class MeetingEdges(AbstractRestCondition, _BetweenEdges):
 
     caption: ClassVar[str] = "edges meet, belts {belt}"
     line: ClassVar[Line] = Line("edges meet", "#D55E00", (0, (1, 1.2)))
+    ends_at_contact: ClassVar[bool] = True
 
     def guess(self, osc, size):
         return None

@@ -38,13 +38,14 @@ class SpecialPoint(NamedTuple):
     where the cycle passes an edge), "EdgeTouch" (on an edge a cycle turns back, is tangent to a
     boundary, or begins to slip), "BoundaryHopf" (a Hopf point on a contact edge: there the curves
     of boundary equilibria and of pseudo-Hopf points meet its own), "BoundaryEquilibrium" (a side of
-    a saddle ceases to push away, and its connection ends), "MeetingEdges" (the saddles of a
-    connection come together), "BeltAtRest", "EqualVelocities", or a function that your own
-    condition watches. With forcing: a condition that holds, too ("PeriodDoubling", "Fold", "Torus",
-    "GrazingSliding", "CrossingSliding", "SwitchingSliding", "AddingSliding", "GrazingEdge",
-    "CornerCollision"; the events of the motion change there), or a strong resonance
-    ("Resonance1to1" to "Resonance1to4": the multipliers of a torus are 1 and 1, -1 and -1, third or
-    fourth roots of 1; Y. A. Kuznetsov, Elements of Applied Bifurcation Theory, chapter 9).
+    a saddle ceases to push away, and its connection ends; or the mass ceases to rest where edges
+    meet), "MeetingEdges" (the saddles of a connection come together), "BeltAtRest",
+    "EqualVelocities", or a function that your own condition watches. With forcing: a condition that
+    holds, too ("PeriodDoubling", "Fold", "Torus", "GrazingSliding", "CrossingSliding",
+    "SwitchingSliding", "AddingSliding", "GrazingEdge", "CornerCollision"; the events of the motion
+    change there), or a strong resonance ("Resonance1to1" to "Resonance1to4": the multipliers of a
+    torus are 1 and 1, -1 and -1, third or fourth roots of 1; Y. A. Kuznetsov, Elements of Applied
+    Bifurcation Theory, chapter 9).
 
     Attributes:
         kind: The kind.
