@@ -106,6 +106,7 @@ def test_a_curve_of_corners_goes_on_where_its_cycle_touches_an_edge():
     assert np.interp(0.3, beyond[:, 1], beyond[:, 0]) == pytest.approx(corner, abs=1e-4)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("step", [0.5, 0.1])
 def test_a_curve_at_infinity_goes_on_until_nothing_rubs(step):
     """zeta = -2/pi p2 u0 for a contact interval of length 1, down to the load 0."""

@@ -458,7 +458,7 @@ def _rest_ended(
     """
     last, beyond = step
     end = beyond._replace(u=u), track.seen_at(u)
-    if beyond.end is Stop.LEFT_SPAN and _is_same_point(u, beyond.u):
+    if beyond.end is Stop.LEFT_SPAN and _at_one_point(u, beyond.u):
         trail = trail._replace(end=Stop.LEFT_SPAN)
     # What is watched vanishes at the end without a change of sign.
     tests, behind, pair = end[1].tests, track.seen_at(beyond.u).tests, (float(u[-2]), float(u[-1]))
@@ -470,11 +470,11 @@ def _rest_ended(
     between = special_between(track, problem.limits, last, end)
     special = [*special, *(one for one in between if (one.kind, one.belts) not in at_end)]
     side = _ended(problem, rows, [*special, *at_end.values()], trail)
-    new = [] if _is_same_point(u, last[0].u) else [_row_at(problem, track, u, end[1])]
+    new = [] if _at_one_point(u, last[0].u) else [_row_at(problem, track, u, end[1])]
     return side._replace(rows=[*rows, *new])
 
 
-def _is_same_point(u: np.ndarray, other: np.ndarray) -> bool:
+def _at_one_point(u: np.ndarray, other: np.ndarray) -> bool:
     return bool(np.linalg.norm((u - other)[-2:]) < SAME_POINT_AGAIN)
 
 

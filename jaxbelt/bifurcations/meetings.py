@@ -205,7 +205,7 @@ class EdgesAtRest(RestSystem):
                 for number, (before, after) in enumerate(zip(left.codes, right.codes, strict=True))
             ]
             modes = left, Mode(tuple(codes)), right
-            pushes = [_pushes(osc, mode, ends[0]) for mode in modes]
+            pushes = [_net_pushes(osc, mode, ends[0]) for mode in modes]
             focus += [jnp.minimum(a, b) for (a, _), (_, b) in pairwise(pushes)]
             held.append(-jnp.maximum(*pushes[1]))
         return focus, held
@@ -220,7 +220,7 @@ def _equal_belts(osc: Oscillator, belt: int | Array, edge: Array) -> list[Array]
     return [same[number] for number in range(n)]
 
 
-def _pushes(osc: Oscillator, mode: Mode, x1: Array) -> tuple[Array, Array]:
+def _net_pushes(osc: Oscillator, mode: Mode, x1: Array) -> tuple[Array, Array]:
     """The forces on the mass at rest to the right and to the left, less what belts at rest hold."""
     needed, held = mode_acceleration(osc, mode, x1, jnp.zeros(())), capacity(osc, mode)
     return needed - held, -needed - held
