@@ -70,8 +70,8 @@ class Grid:
         require(is_concrete(self.example), "make", known, "a traced one")
         check_scalars(self.example)
         self.edges = True
-        self.mapped = traceable(self._varying, "make", returns)
         own = in_units_of_run(self.example, edges=True)
+        self.mapped = traceable(self._varying, "make", returns)
         if len(self.mapped) != len(jax.tree.leaves(own)):
             # A force of a frequency that is known to be 0 is a constant one, of another structure.
             self.example = make(**self._first(lambda values: np.isfinite(values) & (values != 0)))
