@@ -56,7 +56,7 @@ from .special import (
     where_edge_is_touched,
 )
 from .systems import RestSystem, Seen
-from .tracks import Track, special_between
+from .tracks import Track, special_between, special_on
 
 if TYPE_CHECKING:
     import pandas
@@ -345,7 +345,8 @@ def _side(
     while True:
         note_progress(f"{len(rows)} points on one side")
         most = min(REMESH, problem.max_points - max(len(rows) - 1, 0))
-        leg = _leg(problem, track, u, direction, home, most)
+        is_start = sign > 0 and not rows
+        leg = _leg(problem, track, u, direction, home, most, is_start=is_start)
         points, beyond, end = leg.points, leg.beyond, leg.end
         rows += [_row_at(problem, track, at.u, seen) for at, seen in points[min(len(rows), 1) :]]
         passed = [*special, *leg.special]
@@ -498,8 +499,20 @@ class _Leg(NamedTuple):
     end: Stop
 
 
-def _leg(problem: CurveProblem, track: Track, u, direction, home: _Home, most: int) -> _Leg:
-    """A leg of so many points at most, up to one at which x2 is extreme within an arc."""
+def _leg(
+    problem: CurveProblem,
+    track: Track,
+    u,
+    direction,
+    home: _Home,
+    most: int,
+    *,
+    is_start: bool,
+) -> _Leg:
+    """A leg of so many points at most, up to one at which x2 is extreme within an arc.
+
+    is_start: whether its first point is that at which the curve begins, and no leg has been there.
+    """
     points, special = [], []
     for at in _points_along(problem, track, u, direction, most):
         if points:
@@ -508,6 +521,8 @@ def _leg(problem: CurveProblem, track: Track, u, direction, home: _Home, most: i
         found = special_between(track, problem.limits, points[-1], new) if points else []
         if not new[1].exists:
             return _Leg(points, special, found, at, Stop.STOPPED)
+        if points or is_start:
+            found += special_on(track, problem.limits, new, SHORTEST_PART * problem.step)
         points.append(new)
         special += found
         if at.end is not None:

@@ -145,7 +145,8 @@ def special_between(
     found = []
     for name, start in seen_a.tests.items():
         end = seen_b.tests.get(name, np.nan)
-        if start * end >= 0 or np.isnan(start * end) or max(abs(start), abs(end)) < ALONG:
+        # A zero on a row is one of `special_on`.
+        if np.isnan(start * end) or start * end >= 0 or min(abs(start), abs(end)) < ALONG:
             continue
 
         def probe(part, name=name):
@@ -162,7 +163,7 @@ def special_between(
                 raise _SingularError
             root: Any = brentq(lambda part, probe=probe: probe(part).test, 0.0, 1.0, xtol=1e-14)
             special = probe(root)
-            if abs(special.test) > JUMPS * min(abs(start), abs(end)):
+            if abs(special.test) > max(JUMPS * min(abs(start), abs(end)), ALONG):
                 continue
         except _SingularError:
             ends = _Probe(0.0, start, a.u[-2:], 0.0), _Probe(1.0, end, b.u[-2:], 0.0)
@@ -173,6 +174,28 @@ def special_between(
             found.append((special.part, SpecialPoint(name[0], name[1], pair, special.residual)))
     points = [point for _, point in sorted(found, key=lambda item: item[0])]
     return [one for one in points if not _vanishes_at_rest(one, points)]
+
+
+def special_on(
+    track: Track, limits: np.ndarray, row: tuple[CurvePoint, Seen], aside: float
+) -> list[SpecialPoint]:
+    """Points of codimension two on a row: watched functions that vanish there, and have different
+    signs so far on both sides of it."""
+    at, seen = row
+    if not np.all((limits[:, 0] <= at.u[-2:]) & (at.u[-2:] <= limits[:, 1])):
+        return []
+    found, pair = [], (float(at.u[-2]), float(at.u[-1]))
+    for name, value in seen.tests.items():
+        if not abs(value) < ALONG:
+            continue
+        beside = [track.corrected(at.u, at.tangent, way * aside) for way in (-1.0, 1.0)]
+        behind, ahead = (
+            track.seen_at(one.u).tests[name] if one.found else np.nan for one in beside
+        )
+        if behind * ahead < 0 and min(abs(behind), abs(ahead)) >= ALONG:
+            residual = max(seen.residual, abs(value))
+            found.append(SpecialPoint(name[0], name[1], pair, residual))
+    return [one for one in found if not _vanishes_at_rest(one, found)]
 
 
 def _vanishes_at_rest(point: SpecialPoint, points: list[SpecialPoint]) -> bool:
