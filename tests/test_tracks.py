@@ -19,5 +19,7 @@ def test_a_special_point_on_a_row_is_named_once(start, step):
     curve = jb.bifurcation_curve(point, make, ((-0.5, 1.0), (-3.0, 3.0)), step=step)
     named = {one.kind: one.values for one in curve.special}
     assert [one.kind for one in curve.special] == ["BeltAtRest", "BoundaryHopf", "EqualVelocities"]
-    np.testing.assert_allclose(named["EqualVelocities"], (0.35, 2 * (0.6 + 0.4 / 4.5)), rtol=0, atol=1e-10)
+    np.testing.assert_allclose(
+        named["EqualVelocities"], (0.35, 2 * (0.6 + 0.4 / 4.5)), rtol=0, atol=1e-10
+    )
     np.testing.assert_allclose(named["BeltAtRest"][0], 0.0, rtol=0, atol=1e-10)
