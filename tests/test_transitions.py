@@ -45,7 +45,7 @@ def slopes_on_both_sides(function, edges, h):
 @pytest.mark.parametrize(
     ("make", "forcing"),
     [
-        (halves, ()),
+        pytest.param(halves, (), marks=pytest.mark.slow(first=True)),
         (follows, ()),
         pytest.param(follows, jb.Harmonic(0.5, 1.3), marks=pytest.mark.slow(first=True)),
     ],
