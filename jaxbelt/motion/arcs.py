@@ -15,6 +15,7 @@ ends.
 """
 
 import functools
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -36,7 +37,7 @@ from ..model.oscillator import Oscillator
 from ..model.transitions import directions, leave_slip, leave_stick, stick_phase
 from ..numerics.implicit import step_to_root
 from ..numerics.roots import first_root
-from .integrators import AbstractIntegrator, State, slip_field
+from .integrators import AbstractIntegrator, Field, State, slip_field
 
 #: Signs of x2' and of x2 on an arc: +1 or -1, as numbers.
 Signs = tuple[Array, Array]
@@ -87,9 +88,8 @@ def signs_after(osc: Oscillator, mode: Mode, y: State) -> Signs:
 # --- slip arcs ------------------------------------------------------------------------------------
 
 
-def _all_guards(osc: Oscillator, mode: Mode, signs: Signs, y: State) -> Array:
+def _all_guards(osc: Oscillator, mode: Mode, signs: Signs, x1: Array, x2: Array) -> Array:
     """The guards of a slip arc in the order of `Ends`: boundaries, edges, extrema of x2 and x1."""
-    x1, x2 = y
     a = mode_acceleration(osc, mode, x1, x2)
     guards = [*boundary_guards(osc, mode, x2), *edge_guards(osc, mode, x1)]
     return jnp.stack([*guards, signs[0] * a, signs[1] * x2])
@@ -141,27 +141,52 @@ def slip_arc(
     boundary and no edge is near.
     """
 
-    def count(osc, mode, signs, guards):
+    return arc_to_guard(
+        osc,
+        mode,
+        signs,
+        functools.partial(slip_field, osc, mode),
+        functools.partial(_all_guards, osc, mode, signs),
+        y,
+        integrator,
+        every_extremum=every_extremum,
+    )
+
+
+def arc_to_guard(
+    osc: Oscillator,
+    mode: Mode,
+    signs: Signs,
+    field: Field,
+    guards_of: Callable[..., Array],
+    y: State,
+    integrator: AbstractIntegrator,
+    *,
+    every_extremum: bool,
+) -> SlipArc:
+    """`slip_arc` in a field of one's own. guards_of(*y): the guards in the order of `Ends`."""
+
+    def count(guards):
         return _that_count(osc, mode, signs, guards, every_extremum)
 
     def is_outside(y):
-        return jnp.min(count(osc, mode, signs, _all_guards(osc, mode, signs, y))) < 0
+        return jnp.min(count(guards_of(*y))) < 0
 
-    last = integrator.march(functools.partial(slip_field, osc, mode), y, is_outside)
-    root, ended_by = _first_guard(osc, mode, signs, last, integrator, count)
+    last = integrator.march(field, y, is_outside)
+    root, ended_by = _first_guard(field, guards_of, last, integrator, count)
     # Where not every extremum ends an arc nothing depends on where exactly one does.
     is_sharp = last.outside & (every_extremum | (ended_by < 3 * len(osc.belts)))
 
     def guard_fired(*y):
-        guards = _all_guards(osc, mode, signs, y)
+        guards = guards_of(*y)
         return jnp.sum(jnp.where(jnp.arange(guards.size) == ended_by, guards, 0.0))
 
     # Newton steps from the root, small ones, for its last digits. The third pass makes the state at
     # the length that the second one found.
     def polish(carry, _):
         h = carry[0]
-        y = integrator.step(functools.partial(slip_field, osc, mode), last.start, h)
-        guard, slope = jax.jvp(guard_fired, y, slip_field(osc, mode, y))
+        y = integrator.step(field, last.start, h)
+        guard, slope = jax.jvp(guard_fired, y, field(y))
         regular = jnp.abs(slope) * 1e-3 * last.length > jnp.abs(guard)
         return (h + step_to_root(guard, slope, where=is_sharp & regular), h, y), None
 
@@ -170,16 +195,12 @@ def slip_arc(
     return SlipArc(last.t + h, y, jnp.where(last.outside, ended_by, -1), ~last.finished)
 
 
-def _first_guard(osc, mode, signs, last, integrator, count) -> tuple[Array, Array]:
+def _first_guard(field, guards_of, last, integrator, count) -> tuple[Array, Array]:
     """When within the last step a guard first vanishes, and which."""
-    field = functools.partial(slip_field, osc, mode)
 
     def guards_at(y):
-        def guards(*y):
-            return _all_guards(osc, mode, signs, y)
-
-        values, slopes = jax.jvp(guards, y, field(y))
-        return count(osc, mode, signs, values), slopes
+        values, slopes = jax.jvp(guards_of, y, field(y))
+        return count(values), slopes
 
     values, slopes = guards_at(last.end)
     return first_root(

@@ -333,14 +333,19 @@ def simulate(
 
     The formulation "filippov" is exact and event-driven. "switch" is the paper's switch model, eqs.
     (21)-(23), with a band of half-width v_star around each boundary; "smooth" has tanh(r/eps) in
-    place of sgn(r). The last two have no events.
+    place of sgn(r). The last two return no events; contact edges are found in them as well. A run
+    that passes an edge ever faster, as around a pseudo-focus, ends there with TOO_MANY_STEPS, and
+    NaN from there on.
 
     Works under `jax.jit`, `jax.vmap` (batches), `jax.jacfwd` and `jax.jacrev`. There the lengths
     are padded (see `Events`); outside they are cut. Derivatives are those of the arcs in their
     present order. Where this order changes exactly at the given numbers, as where two belts have
     one velocity or an orbit grazes a boundary, the derivatives of the two sides differ, and the
     returned one may be neither: step aside by 1e-6 for that of one side. Velocities that stay equal
-    are varied together.
+    are varied together. Derivatives of "smooth" are right by every number, edges included. Those of
+    "switch" have the jumps at edges and lack those at the band, so that after the first time that a
+    run enters or leaves a band all derivatives but the last state's by t1 are wrong, and the
+    derivative by v_star is 0: take them from "filippov" or "smooth".
 
     Args:
         osc: The oscillator.
@@ -380,17 +385,21 @@ def simulate(
     check_finite(t1, "t1")
     if is_concrete((t0, t1)) and not t1 > t0:
         require(False, "t1", f"> t0 = {t0}", t1)
-    rtol, atol = as_positive_number(rtol, "rtol"), as_size(atol, "atol")
+    rtol = as_positive_number(rtol, "rtol")
     if ts is not None:
         ts = _checked_times(ts, t0, t1)
     require_one_of(formulation, ("filippov", "switch", "smooth"), "formulation")
     for name, width, of in (("v_star", v_star, "switch"), ("eps", eps, "smooth")):
         expected = f'left out unless formulation="{of}"'
         require(width is None or formulation == of, name, expected, width)
-    padded = not is_concrete((osc, y0, t0, t1, ts, rtol, atol))
+    width, name = (v_star, "v_star") if formulation == "switch" else (eps, "eps")
+    # Those that are left out become NaN.
+    sizes = [rtol, *(one for one in (atol, width) if one is not None)]
+    atol, width = as_size(atol, "atol"), as_size(width, name)
+    padded = not is_concrete((osc, y0, t0, t1, ts, *sizes))
     if padded:
         y0 = jnp.asarray(y0)
-        y0 = nan_unless(_are_possible(t0, t1, ts, rtol), y0, y0)
+        y0 = nan_unless(_are_possible(t0, t1, ts, sizes), y0, (y0, sizes))
     ends_at_t1 = ts is None or (
         is_concrete((ts, t1)) and np.size(ts) > 0 and bool(np.asarray(ts)[-1] == t1)
     )
@@ -402,8 +411,6 @@ def simulate(
     span = float(t1 - t0) if is_concrete((t0, t1)) else 100.0
     resolution = 0 if ts is not None else _room_for(10 * span, 512)
     if formulation != "filippov":
-        name = "v_star" if formulation == "switch" else "eps"
-        width = as_size(v_star if formulation == "switch" else eps, name)
         fixed = dict(formulation=formulation, resolution=resolution)
         found = _smoothed(osc, *given, width=width, **fixed)
         return found if samples is None else _first_samples(found, samples)
@@ -423,9 +430,13 @@ def simulate(
     return _without_padding(trajectory, trim_samples=ts is None, samples=samples)
 
 
-def _are_possible(t0: Any, t1: Any, ts: Any, rtol: Any) -> Array:
-    """Whether traced arguments are such that known ones would not raise."""
-    possible = (t1 > t0) & (jnp.asarray(rtol) > 0)
+def _are_possible(t0: Any, t1: Any, ts: Any, sizes: list[Any]) -> Array:
+    """Whether traced arguments are such that known ones would not raise.
+
+    sizes: tolerances and widths that are given.
+    """
+    given = jnp.stack([jnp.asarray(size) for size in sizes])
+    possible = (t1 > t0) & jnp.all((given > 0) & jnp.isfinite(given))
     if ts is None:
         return possible
     ts, rounding = jnp.asarray(ts), 1e-14 * (jnp.abs(t0) + jnp.abs(t1))
