@@ -46,7 +46,7 @@ from .runs import SAFETY
 MAX_STEPS_A_SAMPLE = 1_000_000
 #: Longest piece between two edges, times the highest frequency; longer ones are cut. Longest and
 #: first step, as fractions of it.
-LONGEST_PIECE, LONGEST_STEP, FIRST_STEP = 1.0, 0.5, 0.2
+LONGEST_PIECE, LONGEST_OF_PIECE, FIRST_OF_PIECE = 1.0, 0.5, 0.2
 #: Pieces that end at an edge or an extremum, beyond so many per unit of time, before a run between
 #: two samples is given up: it may pass an edge ever faster.
 MAX_ENDED_PIECES, ENDED_PIECES_RATE = 5_000, 100.0
@@ -193,11 +193,11 @@ class _Tsit5(AbstractIntegrator):
             _tsit5(),
             t0=jnp.zeros_like(span),
             t1=self.span,
-            dt0=FIRST_STEP * span,
+            dt0=FIRST_OF_PIECE * span,
             y0=y,
             saveat=dfx.SaveAt(solver_state=True),
             stepsize_controller=dfx.PIDController(
-                rtol=self.rtol, atol=self.atol, dtmax=LONGEST_STEP * span
+                rtol=self.rtol, atol=self.atol, dtmax=LONGEST_OF_PIECE * span
             ),
             event=dfx.Event(ends_outside),
             adjoint=dfx.ForwardMode(),
@@ -216,7 +216,7 @@ class _Tsit5(AbstractIntegrator):
 Codes = Array
 
 
-def _packed(mode: Mode, signs: tuple[Array, ...]) -> Codes:
+def _codes_of(mode: Mode, signs: tuple[Array, ...]) -> Codes:
     codes = [jnp.where(on, 1, code) for on, code in zip(mode.touching, mode.codes, strict=True)]
     return jnp.stack([jnp.asarray(one).astype(int) for one in (*codes, *signs)])
 
@@ -228,13 +228,13 @@ def _signs(rates: State, default: Array) -> tuple[Array, Array]:
     return of_x2, jnp.where(of_x1 == 0, of_x2, of_x1)
 
 
-def _begun(field: Callable, osc: Oscillator, width: Array, y: State) -> Codes:
+def _codes_at_start(field: Callable, osc: Oscillator, width: Array, y: State) -> Codes:
     """Contacts and signs at the start; an edge there is on the side that the motion comes from."""
     now = at_time(osc, *y[2:]) if has_clock(osc) else osc
     right, left = (contact(now, *y[:2], rightward=rightward) for rightward in (True, False))
     one = jnp.ones_like(y[0])
     signs = _signs(field(osc, y, width, right.slipping(1.0)), one)
-    return _packed(select(signs[1] > 0, right, left), signs)
+    return _codes_of(select(signs[1] > 0, right, left), signs)
 
 
 def _piece(field, osc: Oscillator, width, y: State, codes: Codes, span, rtol, atol):
@@ -280,7 +280,7 @@ def _piece(field, osc: Oscillator, width, y: State, codes: Codes, span, rtol, at
     rates = field(osc, end, width, after)
     new_signs = _signs(rates, signs[0])[0], signs[1]
     signs = select(at_edge, new_signs, flipped)
-    return arc.duration, end, _packed(after, signs), arc.ended_by >= 0, arc.failed
+    return arc.duration, end, _codes_of(after, signs), arc.ended_by >= 0, arc.failed
 
 
 @forward_jacobian
@@ -329,6 +329,6 @@ def integrate(field, osc: Oscillator, width: Array, y0, t0, ts, rtol, atol) -> A
         return (t, y, codes), jnp.stack(y)
 
     start = (y0[0], y0[1], t0) if has_clock(osc) else (y0[0], y0[1])
-    codes = _begun(field, osc, width, start) if edges else None
+    codes = _codes_at_start(field, osc, width, start) if edges else None
     ys = lax.scan(advance, (t0, start, codes), ts)[1]
     return ys[:, :2] if has_clock(osc) else ys
