@@ -265,9 +265,11 @@ def test_derivatives_of_the_smooth_formulation(forced):
         def moved(value, i=i):
             return expected(np.where(np.arange(POINT.size) == i, value, POINT))
 
-        difference, _ = oracle.richardson(moved, POINT[i], 8e-3)
-        # Errors of 1e-11 in the oracle over steps of 2e-3, and its field bends within 0.25.
-        np.testing.assert_allclose(column, difference, rtol=0, atol=5e-8)
+        # Edges that are at one place, 0 and 2, change their order there: second derivatives jump,
+        # and differences are good to their step; else to errors of 1e-11 over steps of 2e-3.
+        step, tolerance = (1e-5, 2e-6) if i in (0, 2) else (8e-3, 5e-8)
+        difference, _ = oracle.richardson(moved, POINT[i], step)
+        np.testing.assert_allclose(column, difference, rtol=0, atol=tolerance)
 
 
 @pytest.mark.slow
