@@ -36,7 +36,8 @@ BeltAtRest BifurcationCurve BifurcationDiagram BoundaryEquilibrium CircleMap Cor
 CrossingSliding Design-class EdgeExchange Exponents FatalShock Fit-class Fold FoldOfCycles
 GrazingEdge MeetingEdges
 OrbitDiagram PeriodDoubling PeriodicMotion Portrait-class PseudoHopf RegionMap SaddleConnection
-Separatrix SpecialPoint SwitchingSliding Torus attractors basin_fractions basin_stability basins
+Separatrix SpecialPoint SwitchingSliding SymmetryBreaking Torus attractors basin_fractions
+basin_stability basins
 bifurcation_curve bifurcation_diagram circle_map class design distance_to distance_to_basin_boundary
 find_cycle fit minimal_fatal_shock orbit_diagram plot_basins portrait region_map scan
 """.split()

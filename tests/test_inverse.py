@@ -359,6 +359,7 @@ def stick(cycle):
     return jb.stick_duration(cycle, 1)
 
 
+@pytest.mark.slow(first=True)
 def test_design_meets_a_stick_duration():
     told = []
     plan = jb.design(jb.presets.class_b(0.45, 0.35), [(stick, 0.5)], where=nu0, report=told.append)
@@ -411,6 +412,7 @@ def test_a_record_of_a_mass_that_sticks_throughout_tells_the_velocity_of_the_bel
     np.testing.assert_allclose(found.estimates, [0.35], rtol=1e-9)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("upper", [np.inf, 1e9])
 def test_a_target_is_missed_by_its_nearer_end(upper):
     """By a part of the farther one it was met at once."""
@@ -459,6 +461,7 @@ def test_a_contact_edge_below_zero_is_designed():
     assert float(jb.amplitude(found.cycle)) == pytest.approx(float(wanted), rel=1e-9)
 
 
+@pytest.mark.slow(first=True)
 def test_a_distance_may_be_infinite():
     """Of a point that is not found, and wanted so."""
     osc, where = jb.presets.class_b(0.45, 0.35), lambda o: o.belts[0].velocity

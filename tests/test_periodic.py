@@ -933,6 +933,7 @@ def test_exponents_of_a_linear_motion_are_known_where_one_is_lost_in_rounding(fr
     np.testing.assert_allclose(found.exponents, expected, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow(first=True)
 def test_areas_change_by_what_multipliers_multiply_to():
     """Across two belts, with a law that bends."""
     belts = (
@@ -947,6 +948,7 @@ def test_areas_change_by_what_multipliers_multiply_to():
     assert float(np.sum(found.per_period)) == pytest.approx(area, abs=1e-9)
 
 
+@pytest.mark.slow(first=True)
 def test_forces_in_either_order_have_the_same_motions():
     """One a hundred times as fast as the other: the slower one was not allowed to be the second."""
     slow, fast = jb.Harmonic(0.5, 0.01), jb.Harmonic(0.9, 1.0)

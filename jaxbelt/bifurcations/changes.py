@@ -2,7 +2,7 @@
 curve goes on where only its signature changes: `beyond_change`."""
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -181,3 +181,13 @@ def from_chords(at: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarra
     along = np.sum((at - a) * chord, axis=1) / np.maximum(np.sum(chord**2, axis=1), 1e-300)
     along = np.clip(along, 0, 1)
     return np.hypot(*(at - a - along[:, None] * chord).T), along
+
+
+def named_once(points: Iterable[SpecialPoint]) -> list[SpecialPoint]:
+    """The points without those that are there already, as where a curve begins at its end."""
+    found: list[SpecialPoint] = []
+    for one in points:
+        alike = [x for x in found if (x.kind, x.belts) == (one.kind, one.belts)]
+        if all(np.hypot(*np.subtract(one.values, x.values)) > SAME_POINT_AGAIN for x in alike):
+            found.append(one)
+    return found

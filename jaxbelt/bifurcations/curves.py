@@ -42,6 +42,7 @@ from .changes import (
     CurveRow,
     beyond_change,
     just_ahead,
+    named_once,
     where_it_ends,
 )
 from .forced import AbstractForcedCondition, UnitCircle
@@ -300,6 +301,7 @@ def follow_point(
         _OneSide(ahead.rows[:1], [], Stop.CLOSED) if closed else _side(problem, point, start, -1.0)
     )
     rows = [*reversed(behind.rows[1:]), *ahead.rows]
+    special = [*reversed(behind.special), *ahead.special]
     return BifurcationCurve(
         condition=point.condition,
         values=units * np.array([row.values for row in rows]),
@@ -307,9 +309,7 @@ def follow_point(
         multiplier=np.array([row.multiplier for row in rows]),
         residual=np.array([row.residual for row in rows]),
         places=np.array([row.place for row in rows]),
-        special=tuple(
-            one.measured_in(units) for one in (*reversed(behind.special), *ahead.special)
-        ),
+        special=tuple(one.measured_in(units) for one in named_once(special)),
         ends=(behind.end, ahead.end),
         names=(variation.names[0], variation.names[1]),
     )

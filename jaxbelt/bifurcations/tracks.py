@@ -2,7 +2,7 @@
 
 A `Track` is the system of a condition with both parameters among its unknowns. Between two points
 of it the watched functions may change their signs: where one does, `special_between` solves for its
-zero, a point of codimension two.
+zero, a point of codimension two; zeros on points of it are those of `special_on`.
 """
 
 from collections.abc import Callable
