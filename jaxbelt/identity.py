@@ -93,21 +93,25 @@ def fingerprint_or_unique(value: Any) -> Any:
 
 def own_parts(value: Any) -> list[Any]:
     """The functions, classes and objects of a user's own that a value is made of, each by itself
-    and not what it reaches; none where the value has no fingerprint."""
-    reading = _Reading("a value")
-    try:
-        reading.digest(value, "")
-    except FingerprintError:
-        return []
+    and not what it reaches."""
+    reading = _Reading("a value", skips=True)
+    reading.digest(value, "")
     return reading.own
+
+
+def fingerprint_of_known(value: Any) -> str:
+    """As `fingerprint`, without what cannot be known."""
+    return _Reading("a value", skips=True).digest(value, "")
 
 
 class _Reading:
     """One call of `fingerprint`: the digests of the objects that were met, and of the user's own
     ones those that no other one led to."""
 
-    def __init__(self, name: str):
+    def __init__(self, name: str, *, skips: bool = False):
         self.name = name
+        #: Whether what cannot be known is left out.
+        self.skips = skips
         self.own: list[Any] = []
         self.inside_own = False
         self.known: dict[int, str] = {}
@@ -131,6 +135,10 @@ class _Reading:
                 self.inside_own = True
             try:
                 self.known[key] = _digest_of(*self.parts(value, place))
+            except FingerprintError:
+                if not self.skips:
+                    raise
+                self.known[key] = "unknown"
             finally:
                 self.open.pop()
                 self.inside_own = self.inside_own and not begins
@@ -242,9 +250,9 @@ class _Reading:
         for i, one in enumerate(instructions):
             if one.opname == "IMPORT_NAME":
                 package = _package_of(one.argval)
-                if package is None:  # the user's own, or not imported until now
+                if package is None and not self.skips:  # the user's own, or not imported until now
                     self.refuse(place, f"an import of {one.argval or 'a module'}: do it outside")
-                yield one.argval, package
+                yield one.argval, package or "unknown"
             name = one.argval
             if one.opname in GLOBALS:
                 value = scope.get(name, getattr(builtins, name, MISSING))

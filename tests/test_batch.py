@@ -431,3 +431,20 @@ def test_impossible_runs_have_no_derivatives_and_harm_no_other_lane():
             np.testing.assert_allclose(
                 slopes[i][rows.index(row)], (more - less) / (2 * step), rtol=0, atol=1e-7
             )
+
+
+@pytest.mark.slow(first=True)
+def test_padding_does_not_spoil_derivatives_in_reverse_mode():
+    def run(nu):
+        return jb.simulate(jb.presets.class_b(nu, 0.35), (3.0, 0.0), 30.0)
+
+    for numbers in (
+        lambda run: run.events.t[4] - run.events.t[0],
+        lambda run: run.arcs.duration[0],
+        lambda run: jnp.nansum(run.events.t),
+    ):
+        backwards, forwards = (
+            mode(lambda nu, numbers=numbers: numbers(run(nu)))(0.45)
+            for mode in (jax.grad, jax.jacfwd)
+        )
+        np.testing.assert_allclose(backwards, forwards, rtol=1e-9)

@@ -73,3 +73,19 @@ def test_labels_of_forced_masses_that_rest_on_an_edge():
     assert np.all(labels.kind[:2] == "equilibrium") and np.all(labels.kind[2] == "chaotic")
     assert np.all(swept.x1_max[:2] == EDGE) and np.all(swept.x1_min[:2] == EDGE)
     assert np.all(swept.transient[:2, 1] == 0.0) and np.all(swept.transient[:2, 0] > 10.0)
+
+
+@pytest.mark.slow(first=True)
+def test_a_force_as_large_as_what_pushes_back_holds_nothing():
+    """0.7 * 0.8 is less than 0.56 by rounding."""
+
+    def make(force):
+        law = jb.Coulomb(1.0, 0.8)
+        belts = jb.Belt(5.0, law, 0.7, upper=0.0), jb.Belt(-5.0, law, 0.7, lower=0.0)
+        return jb.Oscillator(1.0, belts, forcing=jb.Harmonic(force, 1.0))
+
+    runs = [jb.simulate(make(force), (2.0, 0.0), 3.0, ts=[3.0]) for force in (0.5599, 0.56, 0.5601)]
+    assert [int(run.status) for run in runs] == [jb.Status.OK] * 3
+    below, at, above = (np.asarray(run.ys[0]) for run in runs)
+    np.testing.assert_allclose(at, 0.5 * (below + above), rtol=0, atol=1e-7)
+    np.testing.assert_allclose(at, (-0.54434949, -0.16893665), rtol=0, atol=1e-7)

@@ -114,3 +114,21 @@ def test_a_periodic_motion_past_edges_at_one_place(forcing):
     found = jax.jacfwd(numbers)(EDGES)
     for right in slopes_on_both_sides(numbers, EDGES, 1e-5):
         np.testing.assert_allclose(found, right, rtol=0, atol=1e-6)
+
+
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("swapped", [False, True])
+def test_a_forced_run_that_slips_on_where_its_belt_ends(swapped):
+    """While both belts touch the mass it stays stuck, so that the edge of its own belt counts."""
+    law = jb.Coulomb(1.0, 0.8)
+
+    def end(edges):
+        belts = jb.Belt(0.4, law, 0.1, lower=edges[1]), jb.Belt(-0.3, law, 2.0, lower=edges[0])
+        osc = jb.Oscillator(0.1, belts[:: -1 if swapped else 1], forcing=jb.Harmonic(0.4, 1.3))
+        return jb.simulate(osc, (0.0, -0.3), 2.5, ts=[2.5]).ys[-1]
+
+    found, h = jax.jacfwd(end)(-EDGES - 0.2), 1e-6
+    for i, way in ((0, -1), (1, 1)):
+        one = jnp.zeros(2).at[i].set(way * h)
+        right = way * (end(-EDGES - 0.2 + one) - end(-EDGES - 0.2)) / h
+        np.testing.assert_allclose(found[:, i], right, rtol=0, atol=1e-4)

@@ -1,5 +1,8 @@
 """Programs of code of a user's own, which reads what changes: each answer is that of today."""
 
+import dataclasses
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -83,6 +86,36 @@ def test_a_law_that_reads_its_class_and_a_force(monkeypatch):
         np.testing.assert_allclose(end(conti(), Push(jnp.asarray(1.3))), right, rtol=0, atol=1e-8)
 
 
+@dataclasses.dataclass(frozen=True, slots=True)
+class Slotted:
+    """Cannot be referred to weakly."""
+
+    def __call__(self, speed):
+        return residual + 0.0 * speed
+
+
+class Logging(jb.AbstractFriction):
+    """Holds what has no fingerprint, and something that reads a global."""
+
+    static: float
+    made_of: Slotted = eqx.field(static=True)
+
+    def mu(self, speed):
+        _ = NO_FINGERPRINT
+        return self.made_of(speed)
+
+
+NO_FINGERPRINT = (one for one in ())
+
+
+@pytest.mark.slow(first=True)
+def test_parts_without_weak_references_or_fingerprints(monkeypatch):
+    for value in (0.8, 0.6):
+        monkeypatch.setitem(globals(), "residual", value)
+        right = end(jb.Coulomb(1.0, value))
+        np.testing.assert_allclose(end(Logging(1.0, Slotted())), right, rtol=0, atol=1e-9)
+
+
 @pytest.mark.slow(first=True)
 def test_a_functional_whose_attribute_changed():
     osc, wanted = jb.presets.class_b(0.3, 0.35), 0.5
@@ -95,6 +128,8 @@ def test_a_functional_whose_attribute_changed():
 
 
 def test_programs_are_forgotten_only_where_something_changed(monkeypatch):
+    monkeypatch.setitem(globals(), "residual", 0.8)
+    end(Reading(1.0))
     forgotten, forget = [], jax.clear_caches
     monkeypatch.setattr(jax, "clear_caches", lambda: (forgotten.append(1), forget()))
     for value, times in ((0.8, 0), (0.8, 0), (0.6, 1), (0.6, 1)):

@@ -33,17 +33,14 @@ from jaxtyping import Array
 from ..model.instants import carried, field_at
 from ..model.modes import (
     Mode,
-    any_of,
     capacity,
-    edges,
-    first_of,
     has_edges,
     mode_acceleration,
     mode_of,
     stick_velocity,
 )
 from ..model.oscillator import Oscillator, at_time, has_clock
-from ..model.transitions import acting_edge, late_contacts, onset_position
+from ..model.transitions import edge_of_guard, late_contacts, onset_position
 from ..motion.arcs import Ends
 from ..motion.integrators import density
 from ..numerics.compiling import any_lane, lanes_in_one_kernel, one_kernel, one_kernel_alone
@@ -266,17 +263,6 @@ def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, 
     return jnp.where(stuck, stuck_end, slipped)
 
 
-def edge_at_end(osc: Oscillator, mode: Mode, end: Array) -> Array:
-    """The place of the edge at which an arc of a mode ends; 0 where it ends otherwise."""
-    none = jnp.zeros(())
-    if not has_edges(osc):
-        return none
-    numbers = [end == len(osc.belts) + i for i in range(2 * len(osc.belts))]
-    place = first_of(numbers, edges(osc), none)
-    flags = [any_of(numbers) & (edge == place) for edge in edges(osc)]
-    return acting_edge(osc, mode, flags, none)
-
-
 def end_guard(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
     """What vanishes at y if an arc ends there by `end`; zero for an unused one."""
     if has_clock(osc):
@@ -284,7 +270,7 @@ def end_guard(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
     mode = mode_of(codes)
     values = [
         *[belt.velocity - osc.omega * y[1] for belt in osc.belts],
-        *[y[0] - edge_at_end(osc, mode, end)] * (2 * len(osc.belts)),
+        *[y[0] - edge_of_guard(osc, mode, end)] * (2 * len(osc.belts)),
         mode_acceleration(osc, mode, y[0], y[1]),
         y[1],
         y[0] - onset_position(osc, mode),
@@ -305,7 +291,7 @@ def _timed_end_guard(osc: Oscillator, codes: Array, end: Array, y: Array) -> Arr
     n, names = len(osc.belts), Ends(len(osc.belts))
     numbers = [
         *((i, values[i]) for i in range(n)),
-        *((n + i, y[0] - edge_at_end(osc, mode, end)) for i in range(2 * n)),
+        *((n + i, y[0] - edge_of_guard(osc, mode, end)) for i in range(2 * n)),
         (names.extremum_x1, y[1]),
         (names.onset, values[n]),
         *((names.tangent + i, slopes[i]) for i in range(n)),
@@ -320,7 +306,7 @@ def late_at_end(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
     if not has_edges(osc):
         return jnp.zeros(())
     now = at_time(osc, y[2]) if has_clock(osc) else osc
-    late = late_contacts(now, mode, edge_at_end(osc, mode, end), y[1], y[1] > 0)
+    late = late_contacts(now, mode, edge_of_guard(osc, mode, end), y[1], y[1] > 0)
     return jnp.where((end >= n) & (end < 3 * n), late, 0.0)
 
 

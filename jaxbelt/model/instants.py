@@ -44,7 +44,7 @@ from .modes import (
 )
 from .oscillator import MovingBelt, Oscillator, at_time, fastest
 from .pseudofocus import ForceRange, is_captured
-from .transitions import codes_past_edge, late_contacts
+from .transitions import codes_past_edge, edge_of_guard, late_contacts
 
 #: A state with a clock, (x1, x2, t).
 TimedState = tuple[Array, Array, Array]
@@ -322,7 +322,7 @@ def on_guard_at(osc: Oscillator, mode: Mode, guard: Array, y: TimedState) -> Tim
     if not has_edges(osc):
         return x1, jnp.where(mode.any_stuck, x2, x2_slip), t
     at_edge = [guard == n + i for i in range(2 * n)]
-    x1 = first_of(at_edge, edges(osc), x1)
+    x1 = jnp.where(any_of(at_edge), edge_of_guard(osc, mode, guard), x1)
     flags = zip(at_edge, bounds_rightward(mode), strict=True)
     rightward = any_of([one & right for one, right in flags])
     late = jnp.where(any_of(at_edge), late_contacts(now, mode, x1, x2, rightward), 0.0)

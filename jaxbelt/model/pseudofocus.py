@@ -1,7 +1,5 @@
 """The pseudo-focus at a contact edge, and when it captures an orbit."""
 
-import functools
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -121,27 +119,31 @@ def is_captured(
     """
     left = _past_all(osc, left, edge, x2)
     right = _past_all(osc, right, edge, x2, rightward=True)
-    on_left, on_right = (field_at_rest(osc, mode, edge) for mode in (left, right))
+    sides = jax.tree.map(lambda *codes: jnp.stack(codes), left, right)
+    fields = jax.vmap(lambda mode: field_at_rest(osc, mode, edge))(sides)
+    on_left, on_right = (tuple(part[i] for part in fields) for i in range(2))
     nearest, largest = jnp.asarray(jnp.inf), jnp.abs(edge)
     for belt, is_left, is_right in zip(osc.belts, left.touching, right.touching, strict=True):
         rubs, speed = (is_left | is_right) & (belt.load != 0), jnp.abs(belt.velocity) / osc.omega
         nearest = jnp.minimum(nearest, jnp.where(rubs, speed, jnp.inf))
         largest = jnp.maximum(largest, jnp.where(rubs, speed, 0.0))
     size = jnp.abs(x2)
-    around, slow = [(on_left, on_right)], jnp.asarray(True)
-    if forces is not None:
-        around = [
-            tuple((side[0] + push, *side[1:]) for side in (on_left, on_right))
-            for push in (forces.least, forces.most)
-        ]
-        # 1/a_L + 1/|a_R| is convex in the force, and least where both are equal.
-        sums = [1 / one[0] - 1 / other[0] for one, other in around]
-        varies = 0.25 * jnp.maximum(*sums) * (on_left[0] - on_right[0])
-        slow = 2 * size * jnp.maximum(*sums) * forces.frequency < SHORT_LOOP
-        size = size * jnp.cbrt(varies)
-    speeds = size, nearest, largest
-    found = [_is_captured(osc, edge, sides, speeds) for sides in around]
-    return functools.reduce(jnp.logical_and, found, slow & ~left.any_stuck & ~right.any_stuck)
+    slips = ~left.any_stuck & ~right.any_stuck
+    if forces is None:
+        return slips & _is_captured(osc, edge, (on_left, on_right), (size, nearest, largest))
+    pushes, rounding = jnp.stack([forces.least, forces.most]), force_rounding(edge)
+    pushed_back = (on_left[0] + pushes > rounding) & (on_right[0] + pushes < -rounding)
+    # 1/a_L + 1/|a_R| is convex in the force, and least where both are equal.
+    slowness = jnp.max(1 / (on_left[0] + pushes) - 1 / (on_right[0] + pushes), axis=0)
+    varies = 0.25 * slowness * (on_left[0] - on_right[0])
+    speeds = size * jnp.cbrt(varies), nearest, largest
+
+    def of_push(push):
+        sides = tuple((side[0] + push, *side[1:]) for side in (on_left, on_right))
+        return _is_captured(osc, edge, sides, speeds)
+
+    is_short = 2 * size * slowness * forces.frequency < SHORT_LOOP
+    return slips & is_short & jnp.all(pushed_back & jax.vmap(of_push)(pushes), axis=0)
 
 
 def _is_captured(

@@ -138,6 +138,17 @@ def acting_edge(osc: Oscillator, mode: Mode, flags: Sequence[Array], default: Ar
     return foremost(osc, flags, edges(osc), default)
 
 
+def edge_of_guard(osc: Oscillator, mode: Mode, guard: Array) -> Array:
+    """The place of the edge whose guard has that number, see `leave_slip`; 0 of other guards."""
+    none = jnp.zeros(())
+    if not has_edges(osc):
+        return none
+    numbers = [guard == len(osc.belts) + i for i in range(2 * len(osc.belts))]
+    place = first_of(numbers, edges(osc), none)
+    flags = [any_of(numbers) & (edge == place) for edge in edges(osc)]
+    return acting_edge(osc, mode, flags, none)
+
+
 @eqx.filter_custom_jvp
 def late_contacts(
     osc: Oscillator, mode: Mode, edge: Array, x2: Array, rightward: Array | bool
@@ -159,17 +170,15 @@ def _(primals, tangents):
     if along is None or len(osc.belts) == 1:
         return none, none
     after = codes_past_edge(osc, mode, edge, osc.omega * x2, rightward)
-    before, total = mode_acceleration(osc, mode, edge, x2), none
-    for i, belt in enumerate(along.belts):
-        leaves = mode.touching[i] & ~after.touching[i]
-        changes = leaves | ~mode.touching[i] & after.touching[i]
-        codes = (*mode.codes[:i], after.codes[i], *mode.codes[i + 1 :])
-        more = mode_acceleration(osc, Mode(codes), edge, x2) - before
+    total = none
+    for belt, moved, old, new in zip(osc.belts, along.belts, mode.signs, after.signs, strict=True):
+        leaves, arrives = (old != 0) & (new == 0), (old == 0) & (new != 0)
+        more = (new - old) * belt.load * belt.friction.mu(jnp.abs(belt.velocity - osc.omega * x2))
         lower, upper, here = (
-            moved if eqx.is_array(moved) else none for moved in (belt.lower, belt.upper, edge_along)
+            one if eqx.is_array(one) else none for one in (moved.lower, moved.upper, edge_along)
         )
         later = jnp.where(leaves == rightward, upper, lower) - here
-        total = total - jnp.where(changes, more * later, 0.0)
+        total = total - jnp.where(leaves | arrives, more * later, 0.0)
     slips = ~mode.any_stuck & ~after.any_stuck & (x2 != 0)
     return none, jnp.where(slips, total / jnp.where(slips, x2, 1.0), 0.0)
 

@@ -31,7 +31,7 @@ from ..model.modes import (
 )
 from ..model.oscillator import Oscillator, has_clock
 from ..model.rest import is_slow
-from ..model.transitions import on_guard
+from ..model.transitions import edge_of_guard, on_guard
 from ..numerics.compiling import LARGEST, any_lane, axes_of, one_kernel
 from ..numerics.derivatives import moving_and_fixed
 from ..numerics.implicit import delay_of_root
@@ -140,8 +140,10 @@ def _passed_in_time(
     known = x1, x2, t
 
     def fired_guard(x1, x2, t):
-        guards = guards_at(osc, mode, (x1, x2, t))
-        return jnp.sum(jnp.where(jnp.arange(guards.size) == arc.ended_by, guards, 0.0))
+        n, guards = len(osc.belts), guards_at(osc, mode, (x1, x2, t))
+        fired = jnp.sum(jnp.where(jnp.arange(guards.size) == arc.ended_by, guards, 0.0))
+        at_edge = (arc.ended_by >= n) & (arc.ended_by < 3 * n)
+        return jnp.where(at_edge, x1 - edge_of_guard(osc, mode, arc.ended_by), fired)
 
     late = delay_of_root(fired_guard, known, field_at(osc, mode, known))
     late = jnp.where(arc.in_time, remaining - arc.duration, late)

@@ -87,5 +87,6 @@ def nan_unless(known: Array, values: Any, of: Any) -> Any:
     # Some that are known are infinite, as edges are.
     usable = [jnp.where(known & ~jnp.isfinite(leaf), 0.0, leaf) for leaf in numbers]
     total = sum(jnp.sum(leaf) for leaf in usable)
-    factor = 1.0 + total * jnp.where(known, 0.0, jnp.nan)
-    return jax.tree.map(lambda leaf: factor * leaf if eqx.is_inexact_array(leaf) else leaf, values)
+    # Added: what multiplies a NaN, as in padding, has the derivative NaN in reverse mode.
+    nothing = total * jnp.where(known, 0.0, jnp.nan)
+    return jax.tree.map(lambda x: x + nothing if eqx.is_inexact_array(x) else x, values)

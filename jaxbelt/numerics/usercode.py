@@ -16,10 +16,11 @@ from typing import Any
 import jax
 from jax.core import Tracer
 
-from ..identity import REPR_TYPES, FingerprintError, fingerprint, is_installed, own_parts
+from ..identity import REPR_TYPES, fingerprint_of_known, is_installed, own_parts
 
-#: By the address of a part: a reference that ends with it, and its fingerprint.
-_remembered: dict[int, tuple[weakref.ref, str]] = {}
+#: By the address of a part: a reference that ends with it, or the part itself, and its
+#: fingerprint.
+_remembered: dict[int, tuple[Any, str]] = {}
 #: Whether a call whose arguments are watched is under way: the calls in its trace are part of it.
 _in_call = contextvars.ContextVar("in_call", default=False)
 #: What else is to be forgotten with JAX's programs.
@@ -39,7 +40,8 @@ def watched(leaves: list[Any], structure: Any) -> Iterator[None]:
     if not parts:
         yield
         return
-    new = [part for part in parts if _print_of(part) != _remembered.get(id(part), (None, ""))[1]]
+    known = [_remembered.get(id(part), (None, ""))[1] for part in parts]
+    new = [part for part, was in zip(parts, known) if fingerprint_of_known(part) != was]
     if any(id(part) in _remembered for part in new):
         jax.clear_caches()
         for forget in _also_forgotten:
@@ -77,15 +79,10 @@ def _parts_of_leaves(leaves: list[Any]) -> list[Any]:
     return found
 
 
-def _print_of(part: Any) -> str:
-    try:
-        return fingerprint(part)
-    except FingerprintError:
-        return ""
-
-
 def _remember(part: Any) -> None:
     key = id(part)
-    with contextlib.suppress(TypeError):  # what cannot be referred to weakly
-        reference = weakref.ref(part, lambda _: _remembered.pop(key, None))
-        _remembered[key] = reference, _print_of(part)
+    try:
+        held: Any = weakref.ref(part, lambda _: _remembered.pop(key, None))
+    except TypeError:  # an object with slots
+        held = part
+    _remembered[key] = held, fingerprint_of_known(part)
