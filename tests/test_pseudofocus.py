@@ -59,6 +59,12 @@ def test_a_forced_mass_comes_to_rest_where_loops_shrink(case, rests):
 
 
 @pytest.mark.slow
+def test_no_periodic_motion_is_found_where_the_mass_comes_to_rest():
+    found = jb.find_cycle(osc(0.1, 1.3), (0.6, 0.0))
+    assert found.status == jb.Status.PSEUDO_FOCUS
+
+
+@pytest.mark.slow
 def test_labels_of_forced_masses_that_rest_on_an_edge():
     axes = {"force": np.array([0.1, 0.45, 0.55]), "x1": np.array([1.0, EDGE])}
     swept = jb.sweep(

@@ -40,7 +40,8 @@ def attracted(osc: Oscillator, y0: Any, turns: int) -> PeriodicMotion:
     failed: dict[int, float] = {}
     for run in range(1, MOST_SLOW + 1):
         followed = arcs_over(osc, y, turns)
-        if len(followed.starts) <= PERIODS_AT_ONCE:
+        rests = followed.status == Status.PSEUDO_FOCUS
+        if rests or len(followed.starts) <= PERIODS_AT_ONCE:
             return nothing_found(osc, turns, followed.status or Status.NOT_FINITE.value)
         nearly = _nearly_back(followed.starts)
         # Slow approaches are tried now and then, and any other once it is nearer by far.
