@@ -215,7 +215,7 @@ def _smoothed(given, y0, t0, t1, ts, rtol, atol, *, width, formulation, resoluti
     field = switch_field if formulation == "switch" else smooth_field
     start_known = jnp.all(jnp.isfinite(y0)) & has_possible_numbers(osc)
     ys = integrate(field, osc, width, y0, t0, ts, rtol, atol)
-    ys = nan_unless(start_known, ys, (given, y0, t0, t1, ts))
+    ys = ys + nan_unless(start_known, (given, y0, t0, t1, ts))
 
     def mode_at(y, *t):
         osc = at_time(own, *t) if t else own
@@ -252,6 +252,8 @@ def _filippov(
         wanted_times = ts[:-1] if ends_at_t1 else ts
     if not has_clock(osc):
         y0 = jnp.stack(start_at_focus(osc, *y0))
+    possible = jnp.all(jnp.isfinite(y0)) & has_possible_numbers(osc)
+    nothing = nan_unless(possible, (given, y0, t0, t1, ts))
     final, records, loop, samples = arcs_of_run(osc, y0, t0, t1, wanted_times, rtol, atol, rules)
     _, period = loop.end(records.event_t)
     count = jnp.cumsum(records.kind > 0)
@@ -259,26 +261,30 @@ def _filippov(
     happened = wanted <= loop.total(count)
     rows, later = loop.place(wanted, count)
     events = Events(
-        t=jnp.where(happened, records.event_t[rows] + later * period, jnp.nan),
-        y=jnp.where(happened[:, None], _without_clock(records.event_y)[rows], jnp.nan),
+        t=jnp.where(happened, records.event_t[rows] + later * period, jnp.nan) + nothing,
+        y=jnp.where(happened[:, None], _without_clock(records.event_y)[rows], jnp.nan) + nothing,
         kind=jnp.where(happened, records.kind[rows], 0),
         belt=jnp.where(happened, records.belt[rows], -1),
     )
     too_many = loop.total(count) > max_events
     status = jnp.where(too_many, Status.TOO_MANY_SEGMENTS.value, final.status)
     ys, modes = states_at(osc, final, records, loop, samples, wanted_times)
+    ys = ys + nothing
     numbers = jnp.arange(1, max(rules.max_segments, count.size) + 1)
     rows, later = loop.place(numbers, numbers[: count.size])
-    t = records.t[rows] + later * period
-    arcs = Arcs(t, _without_clock(records.y)[rows], records.mode[rows], records.duration[rows])
+    t = records.t[rows] + later * period + nothing
+    y, durations = _without_clock(records.y)[rows] + nothing, records.duration[rows] + nothing
+    arcs = Arcs(t, y, records.mode[rows], durations)
     if last is not None:
         y1, mode1 = state_at_end(final, records, loop, t1)
+        y1 = y1 + nothing
         is_last = (jnp.arange(ys.shape[0]) == last)[:, None]
         ys, modes = jnp.where(is_last, y1, ys), jnp.where(is_last, mode1, modes)
     rows = wanted_times, ys, modes
     if ends_at_t1:
         # The last row is separate: where it alone is used, no other sample is computed.
         y1, mode1 = state_at_end(final, records, loop, t1)
+        y1 = y1 + nothing
         if ts is None:
             # An even grid, and between its points the entries of the arcs, which are known already.
             unused = jnp.isnan(arcs.t)
@@ -293,8 +299,6 @@ def _filippov(
         ends = t1, y1, mode1
         rows = jax.tree.map(lambda leaf, end: jnp.concatenate([leaf, end[None]]), rows, ends)
     ts, ys, modes = rows
-    possible = jnp.all(jnp.isfinite(y0)) & has_possible_numbers(osc)
-    ys, events, arcs = nan_unless(possible, (ys, events, arcs), (given, y0, t0, t1, ts))
     return in_given_units(Trajectory(ts, ys, modes, events, arcs, status), given, osc)
 
 
@@ -399,7 +403,7 @@ def simulate(
     padded = not is_concrete((osc, y0, t0, t1, ts, *sizes))
     if padded:
         y0 = jnp.asarray(y0)
-        y0 = nan_unless(_are_possible(t0, t1, ts, sizes), y0, (y0, sizes))
+        y0 = y0 + nan_unless(_are_possible(t0, t1, ts, sizes), (y0, sizes))
     ends_at_t1 = ts is None or (
         is_concrete((ts, t1)) and np.size(ts) > 0 and bool(np.asarray(ts)[-1] == t1)
     )

@@ -77,16 +77,14 @@ def in_directions(
     return eqx.combine(changing, others), [linear(slope) for slope in slopes]
 
 
-def nan_unless(known: Array, values: Any, of: Any) -> Any:
-    """The values where `known`, else NaN with the derivative NaN by each number of `of`.
+def nan_unless(known: Array, of: Any) -> Array:
+    """0 where `known`, else NaN with the derivative NaN by each number of `of`, a tree.
 
-    A NaN that `jnp.where` selects has the derivative 0, which looks like an extremum. known: one
-    truth value. values, of: trees; leaves that are not inexact are left as they are.
+    To be added to results: a NaN that `jnp.where` selects has the derivative 0, which looks like an
+    extremum; and what multiplies a NaN, as in padding, has the derivative NaN in reverse mode.
+    known: one truth value.
     """
     numbers = [jnp.asarray(leaf) for leaf in jax.tree.leaves(of) if eqx.is_inexact_array(leaf)]
     # Some that are known are infinite, as edges are.
     usable = [jnp.where(known & ~jnp.isfinite(leaf), 0.0, leaf) for leaf in numbers]
-    total = sum(jnp.sum(leaf) for leaf in usable)
-    # Added: what multiplies a NaN, as in padding, has the derivative NaN in reverse mode.
-    nothing = total * jnp.where(known, 0.0, jnp.nan)
-    return jax.tree.map(lambda x: x + nothing if eqx.is_inexact_array(x) else x, values)
+    return sum(map(jnp.sum, usable), jnp.zeros(())) * jnp.where(known, 0.0, jnp.nan)
