@@ -335,7 +335,7 @@ def _is_users(value: Any) -> bool:
         return _package_of(value.__globals__.get("__name__")) is None
     kind = value if isinstance(value, type) else type(value)
     # Modules in C have no file, and may not be there.
-    top = kind.__module__.partition(".")[0]
+    top = str(kind.__module__).partition(".")[0]
     return top in sys.modules and not (_package_of(kind.__module__) or _package_of(top))
 
 

@@ -509,10 +509,8 @@ def _leg(
     *,
     is_start: bool,
 ) -> _Leg:
-    """A leg of so many points at most, up to one at which x2 is extreme within an arc.
-
-    is_start: whether its first point is that at which the curve begins, and no leg has been there.
-    """
+    """A leg of so many points at most, up to one at which x2 is extreme within an arc; is_start:
+    whether its first point is that at which the curve begins, and no leg has been there."""
     points, special = [], []
     for at in _points_along(problem, track, u, direction, most):
         if points:
@@ -522,7 +520,8 @@ def _leg(
         if not new[1].exists:
             return _Leg(points, special, found, at, Stop.STOPPED)
         if points or is_start:
-            found += special_on(track, problem.limits, new, SHORTEST_PART * problem.step)
+            aside = SHORTEST_PART * problem.step
+            found += special_on(track, problem.limits, aside, new, *points[-1:])
         points.append(new)
         special += found
         if at.end is not None:

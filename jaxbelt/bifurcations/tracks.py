@@ -177,16 +177,25 @@ def special_between(
 
 
 def special_on(
-    track: Track, limits: np.ndarray, row: tuple[CurvePoint, Seen], aside: float
+    track: Track,
+    limits: np.ndarray,
+    aside: float,
+    row: tuple[CurvePoint, Seen],
+    before: tuple[CurvePoint, Seen] | None = None,
 ) -> list[SpecialPoint]:
     """Points of codimension two on a row: watched functions that vanish there, and have different
-    signs so far on both sides of it."""
+    signs so far on both sides of it.
+
+    aside: how far from it they are looked at. before: the row before; what vanishes there, too,
+    does so all along the curve.
+    """
     at, seen = row
     if not np.all((limits[:, 0] <= at.u[-2:]) & (at.u[-2:] <= limits[:, 1])):
         return []
     found, pair = [], (float(at.u[-2]), float(at.u[-1]))
     for name, value in seen.tests.items():
-        if not abs(value) < ALONG:
+        last = np.inf if before is None else before[1].tests.get(name, np.inf)
+        if not abs(value) < ALONG or abs(last) < ALONG:
             continue
         beside = [track.corrected(at.u, at.tangent, way * aside) for way in (-1.0, 1.0)]
         behind, ahead = (

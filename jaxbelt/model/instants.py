@@ -30,7 +30,6 @@ from .modes import (
     Mode,
     any_of,
     boundary_guards,
-    bounds_rightward,
     capacity,
     edge_guards,
     edges,
@@ -44,7 +43,7 @@ from .modes import (
 )
 from .oscillator import MovingBelt, Oscillator, at_time, fastest
 from .pseudofocus import ForceRange, is_captured
-from .transitions import codes_past_edge, edge_of_guard, late_contacts
+from .transitions import codes_past_edge, edge_of_guard, is_passed_rightward, late_contacts
 
 #: A state with a clock, (x1, x2, t).
 TimedState = tuple[Array, Array, Array]
@@ -321,11 +320,10 @@ def on_guard_at(osc: Oscillator, mode: Mode, guard: Array, y: TimedState) -> Tim
     x2 = stick_velocity(now, mode, osc.omega * x2_slip) / osc.omega
     if not has_edges(osc):
         return x1, jnp.where(mode.any_stuck, x2, x2_slip), t
-    at_edge = [guard == n + i for i in range(2 * n)]
-    x1 = jnp.where(any_of(at_edge), edge_of_guard(osc, mode, guard), x1)
-    flags = zip(at_edge, bounds_rightward(mode), strict=True)
-    rightward = any_of([one & right for one, right in flags])
-    late = jnp.where(any_of(at_edge), late_contacts(now, mode, x1, x2, rightward), 0.0)
+    at_edge = (guard >= n) & (guard < 3 * n)
+    x1 = jnp.where(at_edge, edge_of_guard(osc, mode, guard), x1)
+    late = late_contacts(now, mode, x1, x2, is_passed_rightward(mode, guard))
+    late = jnp.where(at_edge, late, 0.0)
     return x1, jnp.where(mode.any_stuck, x2, x2_slip + late), t
 
 
@@ -355,9 +353,7 @@ def passed_guard(osc: Oscillator, mode: Mode, guard: Array, y: TimedState) -> In
     captured = jnp.zeros_like(stuck)
     if has_edges(osc):
         at_edge = (guard >= n) & (guard < 3 * n)
-        hit = [guard == n + i for i in range(2 * n)]
-        flags = zip(hit, bounds_rightward(mode), strict=True)
-        rightward = any_of([one & right for one, right in flags])
+        rightward = is_passed_rightward(mode, guard)
         beyond = codes_past_edge(at_time(osc, t), mode, y[0], osc.omega * x2, rightward)
         # A sign for those with r = 0, which are resolved below.
         beyond = beyond.slipping(1.0)
@@ -435,5 +431,6 @@ def _force_and_bound(osc: Oscillator, t: Array) -> tuple[Array, Array]:
 
 
 def _forces_around(osc: Oscillator, t: Array) -> ForceRange:
+    """What the waves of force may add, at other times, to what they are at the time t."""
     force, bound = _force_and_bound(osc, t)
     return ForceRange(-bound - force, bound - force, fastest(osc))

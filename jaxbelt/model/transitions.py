@@ -149,6 +149,13 @@ def edge_of_guard(osc: Oscillator, mode: Mode, guard: Array) -> Array:
     return acting_edge(osc, mode, flags, none)
 
 
+def is_passed_rightward(mode: Mode, guard: Array) -> Array:
+    """Whether the edge whose guard has that number is passed to the right; not of other guards."""
+    first = len(mode.codes)
+    flags = enumerate(bounds_rightward(mode), first)
+    return any_of([(guard == number) & right for number, right in flags])
+
+
 @eqx.filter_custom_jvp
 def late_contacts(
     osc: Oscillator, mode: Mode, edge: Array, x2: Array, rightward: Array | bool
@@ -309,11 +316,7 @@ def _guard_of(osc: Oscillator, mode: Mode, guard: Array, x1: Array, x2: Array) -
     if not has_edges(osc):
         edgeless = x1, at_edge, at_edge, x1
         return _Guard(at_boundary, at_edge, x1, x2_after, held, x2_boundary, *edgeless)
-    edge_hit = [guard == n + i for i in range(2 * n)]
-    edge = first_of(edge_hit, edges(osc), x1)
-    edge = acting_edge(osc, mode, [other == edge for other in edges(osc)], edge)
-    flags = zip(edge_hit, bounds_rightward(mode), strict=True)
-    rightward = any_of([hit & right for hit, right in flags])
+    edge, rightward = edge_of_guard(osc, mode, guard), is_passed_rightward(mode, guard)
     released, end = _released_at_edge(osc, held, x1, x2_boundary)
     on_end = at_boundary & released
     x1_after = jnp.where(at_edge, edge, jnp.where(on_end, end, x1))

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
-from jax.core import Tracer
 
 from ..identity import REPR_TYPES, fingerprint_of_known, is_installed, own_parts
 
@@ -72,9 +71,7 @@ def _parts_of_leaves(leaves: list[Any]) -> list[Any]:
     """Of the leaves that are no numbers."""
     found = []
     for leaf in leaves:
-        if isinstance(leaf, (jax.Array, Tracer, *REPR_TYPES)) or hasattr(leaf, "dtype"):
-            continue
-        if not is_installed(leaf):
+        if not (hasattr(leaf, "dtype") or isinstance(leaf, REPR_TYPES) or is_installed(leaf)):
             found += own_parts(leaf)
     return found
 

@@ -319,10 +319,8 @@ class Sampling:
             *state, last = reducer.last_state(found)
             passed[following] = (passed[which] + left_out + last) % turns[following]
             times = (self.at.phase / (2 * np.pi) + passed[following]) * period[following]
-            rests, away = (
-                _have_come_to_rest(found),
-                np.where(found["status"] == Status.STUCK_FOREVER, 0, off),
-            )
+            rests = _have_come_to_rest(found)
+            away = np.where(found["status"] == Status.STUCK_FOREVER, 0, off)
             ends = (np.where(rests, found[at], x) for at, x in zip(ENDS_AT, state, strict=True))
             return np.stack([*(x + away for x in ends), times])
 
