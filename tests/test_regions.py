@@ -145,9 +145,12 @@ def test_pseudo_hopf_points_are_pseudo_foci():
     """Their curve once went on beyond a belt at rest, where there is a fixed point."""
     point = jb.refine(jb.PseudoHopf(0), lambda nu0: over_sigma(nu0, 0.73), at=0.12)
     curve = jb.bifurcation_curve(point, over_sigma, PLANE, step=0.02)
-    for nu0, sigma in curve.values:
+    for nu0, sigma in curve.values[:-1]:
         kinds = np.asarray(jb.equilibria(over_sigma(nu0, sigma)).kind).tolist()
         assert jb.EquilibriumKind.PSEUDO_FOCUS in kinds
+    # At its end, BoundaryHopf, the fixed point of the one belt comes to the edge.
+    nu0, sigma = curve.values[-1]
+    assert jb.equilibria(over_sigma(nu0, sigma)).x1 == pytest.approx([sigma], abs=1e-12)
     assert [end.kind for end in curve.special] == [
         "BeltAtRest", "DegeneratePseudoHopf", "BoundaryHopf"
     ]  # fmt: skip
