@@ -117,6 +117,23 @@ def test_padding_is_not_drawn(two_sided):
     assert len(states(line(alone, "orbit"))) == 401 + trajectory.events.t.size
 
 
+def test_a_run_without_finite_samples_is_named_with_its_status(two_sided):
+    osc, trajectory = two_sided
+    nothing, status = jnp.full_like(trajectory.ys, jnp.nan), jnp.asarray(jb.Status.NOT_FINITE.value)
+    lost = eqx.tree_at(lambda one: (one.ys, one.status), trajectory, (nothing, status))
+    events = eqx.tree_at(lambda one: one.y, lost.events, jnp.full_like(lost.events.y, jnp.nan))
+    lost = eqx.tree_at(lambda one: one.events, lost, events)
+    draws = {
+        "trajectories": lambda: jb.plot_phase_portrait(osc, [trajectory, lost]),
+        "trajectory": lambda: jb.plot_time_history(lost),
+        "traj": lost.plot,
+    }
+    for field, draw in draws.items():
+        with pytest.raises(ValueError, match=f"^{field}.* finite samples, .*status NOT_FINITE: "):
+            draw()
+    assert not plt.get_fignums()
+
+
 def test_without_arcs_the_samples_tell_what_sticks(two_sided):
     _, exact = two_sided
     nothing = jax.tree.map(lambda leaf: leaf[:0], exact.arcs)

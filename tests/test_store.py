@@ -482,6 +482,18 @@ def test_what_cannot_be_told_is_refused_for_stores_only(tmp_path):
     assert not (tmp_path / "a.zarr").exists()
 
 
+def test_a_store_is_the_empty_working_folder(tmp_path, monkeypatch, whole):
+    """It stays where it is: a folder in its place would not be the working folder any more."""
+    folder = tmp_path / "here"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    assert again(".").equals(whole)
+    assert Path.cwd() == folder and (Path() / "zarr.json").exists()
+    assert again(Path()).equals(whole) and again("../here").equals(whole)
+    assert jb.verify(".").finished
+    assert sorted(one.name for one in tmp_path.iterdir()) == [".here.locks", "here"]
+
+
 def test_places_that_cannot_hold_a_store_are_told_before_the_computing(tmp_path, monkeypatch):
     monkeypatch.delattr("jaxbelt.sweeps.work.run")
     (tmp_path / "full").mkdir()

@@ -29,8 +29,8 @@ CONTACT_STYLES = {
 def plot_trajectory(trajectory: Trajectory, ax: Axes | None = None) -> Axes:
     """Displacement and velocity over time, stick phases shaded in the colour of their belt."""
     require_single(trajectory, trajectory.ts, 1)
-    ax = new_axes() if ax is None else ax
     t, ys = path_of(trajectory)
+    ax = new_axes() if ax is None else ax
     ax.plot(t, ys[:, 0], color="black", linewidth=1.1, label=COORDINATES["x1"])
     ax.plot(t, ys[:, 1], color="0.35", linewidth=0.9, linestyle="--", label=COORDINATES["x2"])
     # sorted, so that the key has the belts in order

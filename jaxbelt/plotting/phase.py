@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
 from ..activity import announced
-from ..checks import as_interval, require_one_of, require_value
+from ..checks import as_interval, require, require_one_of, require_value
 from ..cycles.cycle import Cycle
 from ..cycles.portrait import Portrait
 from ..cycles.separatrices import Separatrix
@@ -107,9 +107,9 @@ def plot_time_history(trajectory: Trajectory, ax: Sequence[Axes] | None = None) 
     is_pair = isinstance(ax, Sequence | np.ndarray) and len(ax) == 2
     pair = ax is None or (is_pair and all(isinstance(one, Axes) for one in ax))
     require_value(pair, "ax", "two axes of matplotlib, such as plt.subplots(2)[1], or None", ax)
+    t, ys = path_of(trajectory)
     if ax is None:
         ax = tuple(new_figure().subplots(2, sharex=True))
-    t, ys = path_of(trajectory)
     upper, lower = ax
     for axes, values, name in zip(ax, ys.T, COORDINATES.values(), strict=True):
         axes.plot(t, values, color="black", linewidth=0.9)
@@ -176,11 +176,14 @@ def belt_shading(belt: int) -> dict[str, Any]:
     return {"facecolor": pale, "edgecolor": (*colour[:3], 0.45), "linewidth": 0.0, "hatch": hatch}
 
 
-def path_of(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """Times and states of a trajectory, its events among the samples so that corners are sharp."""
+def path_of(trajectory: Trajectory, field: str = "trajectory") -> tuple[np.ndarray, np.ndarray]:
+    """Times and states of a trajectory, its events among the samples so that corners are sharp;
+    a `ValueError` that names the field where there is none."""
     t = np.concatenate([trajectory.ts, trajectory.events.t])
     ys = np.concatenate([trajectory.ys, trajectory.events.y])
     known = np.isfinite(t) & np.all(np.isfinite(ys), axis=1)
+    if not np.any(known):
+        require(False, field, "a run with finite samples", repr(trajectory))
     order = np.argsort(t[known], kind="stable")
     return t[known][order], ys[known][order]
 
@@ -240,8 +243,8 @@ def plot_phase_portrait(
     require_value(known, "equilibria", "what jb.equilibria returns, or None", equilibria)
     _check_window(xlim, ylim)
     require_axes(ax)
+    paths = [path_of(trajectory, "trajectories")[1] for trajectory in trajectories]
     is_new, ax = ax is None, new_axes() if ax is None else ax
-    paths = [path_of(trajectory)[1] for trajectory in trajectories]
     loops = [path_around(cycle) for cycle in cycles]
     rests: Equilibria = find_equilibria(osc) if equilibria is None else equilibria
     window = _window(osc, [*paths, *loops], rests, xlim, ylim)

@@ -6,6 +6,7 @@ job array, each with its own blocks, write to one store at once. A lock of the f
 held for a moment while locks are taken and released.
 """
 
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +16,12 @@ from typing import Any
 ALL_BLOCKS = 2**63
 #: Seconds that the door may stay closed: a store may be created behind it.
 DOOR_PATIENCE = 60.0
+
+
+def hidden_beside(path: Path, kind: str) -> Path:
+    """The hidden folder of a kind beside a store, which may be the working folder."""
+    path = Path(os.path.abspath(path))
+    return path.with_name(f".{path.name}.{kind}")
 
 
 @contextmanager
@@ -30,7 +37,7 @@ def locked(
     """
     from filelock import FileLock
 
-    folder = path.with_name(f".{path.name}.locks")
+    folder = hidden_beside(path, "locks")
     folder.mkdir(exist_ok=True)
     mine = FileLock(folder / f"{first}-{last}", timeout=0)
     with FileLock(folder / "door", timeout=DOOR_PATIENCE):

@@ -36,7 +36,7 @@ from ..results import draw
 from ..tables import table_of
 from .datasets import NUMBERED, renumber
 from .grid import Blocks, Grid
-from .locks import locked
+from .locks import hidden_beside, locked
 from .question import Question
 
 if TYPE_CHECKING:
@@ -325,7 +325,7 @@ def _create(path: Path, question: Question) -> None:
         "jaxbelt_question": json.dumps(identity),
         "jaxbelt_hash": hashlib.sha256(json.dumps(identity).encode()).hexdigest(),
     }
-    new = path.with_name(f".{path.name}.new")
+    new = hidden_beside(path, "new")
     shutil.rmtree(new, ignore_errors=True)
     empty = xarray.Dataset(coords=table.coordinates(), attrs=attributes)
     empty.to_zarr(new, mode="w", zarr_format=3, consolidated=False)
@@ -362,7 +362,14 @@ def _create(path: Path, question: Question) -> None:
         }
     )
     _consolidate(new)
-    os.replace(new, path)
+    if not path.exists():
+        os.replace(new, path)
+        return
+    # A folder that is there stays, as it may be someone's working folder. What makes it a store
+    # comes last.
+    for part in sorted(new.iterdir(), key=lambda part: part.name == "zarr.json"):
+        os.replace(part, path / part.name)
+    new.rmdir()
 
 
 def _ledger_rows(path: Path, ledger: Any) -> np.ndarray:
