@@ -142,7 +142,7 @@ def simulate(
         import numpy as np
 
         osc = described.oscillator()
-        ts = np.array([end * i / (samples - 1) for i in range(samples)])
+        ts = np.linspace(0.0, end, samples)
         trajectory = jb.simulate(osc, y0, end, ts=ts, formulation=formulation, **asked)
         from ..model.oscillator import has_clock
         from ..paper import steady_cycle
