@@ -286,6 +286,18 @@ def outside_of_traces(function: Callable, instead: str = "") -> Any:
     return call
 
 
+def require_outside_of_jit(name: str, hint: str, **given: Any) -> None:
+    """Raises where a public function that takes derivatives, but not `jit` and `vmap`, is in these.
+
+    hint: what to do there. given: its arguments, of which the first that is traced is named.
+    """
+    for field, value in given.items():
+        known = is_concrete(value) or is_concrete(jax.lax.stop_gradient(value))
+        require(known, field, f"known: {hint}", "a traced one")
+    if not is_outermost():
+        raise ValueError(f"{name} must be called outside of jax.jit: {hint}")
+
+
 def _is_known(value: Any) -> bool:
     try:
         return is_concrete(value)

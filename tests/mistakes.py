@@ -37,6 +37,7 @@ AXES_OF = r"ax must be axes of matplotlib, such as plt.subplots\(\)\[1\], or Non
 OBSERVE = '"final", "attractor" or an object with init, update, finish, got '
 UNITS = r"; multiply by machine\.units instead$"
 TRACED = r" must be known: \w+ is not for jit, vmap or derivatives, got a traced one"
+TRACED_MOTION = r" must be known: under jit and vmap use motion.at\(osc\) of .*, got a traced one"
 
 #: What is called, and a pattern of the message; what begins with "jaxbelt" is a command.
 MISTAKES = [
@@ -645,6 +646,27 @@ MISTAKES = [
         "jax.jit(lambda osc: jb.minimal_fatal_shock(osc, (3.0, 0.0)))(osc)",
         "osc must be known: shocks are not for jit or vmap, got a traced one",
     ),
+    (
+        "jax.jit(lambda y: jb.minimal_fatal_shock(osc, y))(row[:2])",
+        "y0 must be known: shocks are not for jit or vmap, got a traced one",
+    ),
+    ("jax.jit(lambda y: jb.find_cycle(forced, y))(row[:2])", "^y0" + TRACED_MOTION),
+    ("jax.vmap(lambda y: jb.find_cycle(forced, y))(row[None, :2])", "^y0" + TRACED_MOTION),
+    ("jax.jit(lambda osc: jb.find_cycle(osc, (1.0, 0.0)))(forced)", "^osc" + TRACED_MOTION),
+    (
+        "jax.jit(lambda _: jb.find_cycle(forced, (1.0, 0.0)))(0.1)",
+        "find_cycle must be called outside of jax.jit: under jit and vmap use motion.at",
+    ),
+    ("jax.jit(lambda y: jb.periodic(forced, y))(row[:2])", "^guess" + TRACED_MOTION),
+    ("jax.jit(lambda y: jb.lyapunov(forced, y))(row[:2])", "^y0" + TRACED),
+    (
+        "jax.jit(lambda _: jb.lyapunov(forced, (1.0, 0.0)))(0.1)",
+        "lyapunov must be called outside of jax.jit: lyapunov is not for jit, vmap or derivatives",
+    ),
+    (
+        "jax.jit(lambda y: jb.refine(jb.PeriodDoubling(), forced, where=damped, start=y))(row[:2])",
+        "start must be known: points of forced oscillators are not for jit or vmap, got a traced",
+    ),
     ("jax.jit(lambda one: jb.in_si(cycle, one))(machine)", "machine" + TRACED + UNITS),
     (
         "jax.jit(lambda _: jb.in_si(cycle, machine))(0.1)",
@@ -865,6 +887,10 @@ def nu2(osc):
 
 def both(osc):
     return osc.belts[0].velocity, osc.belts[1].velocity
+
+
+def damped(osc):
+    return osc.damping
 
 
 def twice(osc):

@@ -15,7 +15,14 @@ import numpy as np
 from jax import lax
 
 from ..activity import announced
-from ..checks import as_finite, as_whole, is_concrete, require, require_value
+from ..checks import (
+    as_finite,
+    as_whole,
+    is_concrete,
+    require,
+    require_outside_of_jit,
+    require_value,
+)
 from ..cycles.cycle import warn_of_extrapolation
 from ..model.oscillator import Oscillator, check_oscillator, has_clock
 from ..model.parameters import leaf_index
@@ -104,6 +111,8 @@ def refine(
     room = None if max_arcs is None else as_whole(max_arcs, "max_arcs")
     variation, near, value = _begun(condition, osc, where, at)
     if has_clock(near):
+        hint = "points of forced oscillators are not for jit or vmap"
+        require_outside_of_jit("refine", hint, osc=osc, at=at, start=start)
         return given_point(forced_point(condition, variation, value, start), variation)
     # Points of cycles take long to compile, and many of them are bracketed afterwards.
     of_cycle = isinstance(condition, AbstractCycleCondition)

@@ -20,6 +20,7 @@ from ..checks import (
     is_concrete,
     number,
     require,
+    require_outside_of_jit,
 )
 from ..model.events import signature_name
 from ..model.modes import STUCK
@@ -64,6 +65,8 @@ AT_PHASE_0 = 1e-4
 OFF_EVENTS = 0.25
 #: Multipliers are known to this: nearer to the unit circle they may be on it, as without damping.
 ON_THE_CIRCLE = 1e-9
+#: What to do where periodic motions cannot be looked for.
+IN_TRACES = "under jit and vmap use motion.at(osc) of a motion that was found outside"
 #: Newton steps on the state at phase 0 where the arcs that were followed are not those sought.
 OUTER_STEPS = 12
 
@@ -162,7 +165,7 @@ class PeriodicMotion(ClosedMotion):
         check_oscillator(osc)
         own = in_own_units(osc)
         is_single = self.unknowns.ndim == 2
-        if is_concrete((own, self)) and is_single:
+        if is_outermost(own, self) and is_single:
             found = motion_at_unknowns(own, *self._guess_for(osc, own))
             if int(found.status) == Status.NOT_ADMISSIBLE:
                 moved = self._begun_off_events()
@@ -516,6 +519,7 @@ def periodic(osc: Oscillator, guess: ArrayLike | tuple, *, periods: int = 1) -> 
     guess = as_finite(guess, "guess", (2,))
     periods = as_whole(periods, "periods")
     require(periods <= PERIODS_AT_ONCE, "periods", f"at most {PERIODS_AT_ONCE}", periods)
+    require_outside_of_jit("periodic", IN_TRACES, osc=osc, guess=guess)
     return differentiable_motion(
         osc, guess, lambda o, y, turns: periodic_from(o, y, periods, turns)
     )
@@ -524,8 +528,6 @@ def periodic(osc: Oscillator, guess: ArrayLike | tuple, *, periods: int = 1) -> 
 def differentiable_motion(osc: Oscillator, y: Array, find: Any) -> PeriodicMotion:
     """What find(osc, y, turns) finds of the known oscillator in own units, as a function of osc."""
     still, y = lax.stop_gradient((osc, y))
-    expected = "known: under jit and vmap use motion.at(osc) of a motion that was found outside"
-    require(is_concrete((still, y)), "osc", expected, "a traced one")
     turns = turns_of(still)
     own = in_own_units(still)
     motion = find(own, np.asarray(y if own is still else own.units.into(y)), turns)

@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array
 
+from ..checks import require_outside_of_jit
 from ..model.oscillator import Oscillator
 from ..results import Status
 from .followed import PERIODS_AT_ONCE, Followed, after_period, arcs_over
 from .periodic import (
+    IN_TRACES,
     PeriodicMotion,
     differentiable_motion,
     is_same_motion,
@@ -131,6 +133,7 @@ _RIM = np.array([[i, j] for i in (-1.0, 0.0, 1.0) for j in (-1.0, 0.0, 1.0) if (
 
 def motion_reached(osc: Oscillator, y0: Array) -> PeriodicMotion:
     """What `find_cycle` returns of an oscillator with a clock."""
+    require_outside_of_jit("find_cycle", IN_TRACES, osc=osc, y0=y0)
     return differentiable_motion(osc, y0, attracted)
 
 

@@ -20,7 +20,14 @@ from jax import lax
 from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
-from ..checks import as_finite, as_whole, is_concrete, number, require, require_one_of
+from ..checks import (
+    as_finite,
+    as_whole,
+    is_concrete,
+    number,
+    require_one_of,
+    require_outside_of_jit,
+)
 from ..model.oscillator import Oscillator, check_oscillator, refuse_clock
 from ..model.own_units import OwnOscillator, in_given_units, in_units_of_run, quantity, rescaled
 from ..results import Status, describe, draw
@@ -180,11 +187,11 @@ def minimal_fatal_shock(
     refuse_clock(osc, "minimal_fatal_shock", "jb.simulate from several starts")
     y0 = as_finite(y0, "y0", (2,))
     require_one_of(direction, DIRECTIONS, "direction")
+    hint = "shocks are not for jit or vmap"
+    require_outside_of_jit("minimal_fatal_shock", hint, osc=osc, y0=y0)
     given, osc = osc, in_units_of_run(osc)
     y0 = y0 / osc.units.length
     known, start = lax.stop_gradient((osc, y0))
-    concrete = is_concrete((known, start))
-    require(concrete, "osc", "known: shocks are not for jit or vmap", "a traced one")
     shown = portrait(lax.stop_gradient(given)) if shown is None else shown
     own_portrait = _in_units_of(shown, known)
     (end,) = leads_to(own_portrait, np.asarray(start)[None])

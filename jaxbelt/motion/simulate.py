@@ -452,7 +452,10 @@ def _busyness(osc: Oscillator) -> float:
     """How many times as many arcs there may be as without a clock, by its fastest wave."""
     if not has_clock(osc):
         return 1.0
-    return float(fastest(osc)) if is_concrete(osc) else 2.0
+    if not is_concrete(osc):
+        return 2.0
+    with jax.ensure_compile_time_eval():  # known numbers are so in a trace, too
+        return float(fastest(osc))
 
 
 def _budgets(
