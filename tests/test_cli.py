@@ -69,6 +69,23 @@ def test_simulate_writes_what_simulate_returns(tmp_path):
     assert repr(trajectory) in result.output
 
 
+def test_the_last_sample_is_the_end_of_the_span_whatever_it_is(tmp_path):
+    """0.8 * 3 / 3 is larger than 0.8."""
+    out, arguments = str(tmp_path / "run"), "--class a --nu0 0.5 --t1 0.8 --samples 4"
+    result = runner.invoke(app, ["simulate", *arguments.split(), "--out", out])
+    assert result.exit_code == 0, result.output
+    t = column(read(tmp_path / "run.csv"), "t")
+    assert t[-1] == 0.8 and t == pytest.approx([0.0, 0.8 / 3, 1.6 / 3, 0.8], rel=1e-15)
+
+
+def test_a_run_of_which_nothing_is_known_tells_its_status(tmp_path):
+    arguments = "--class b --nu0 0.45 --nu1 0.35 --start 1e308 1e308 " + SPAN
+    result = runner.invoke(app, ["simulate", *arguments.split(), "--out", str(tmp_path / "run")])
+    assert result.exit_code == 2
+    assert result.stderr.startswith("Error: trajectory must be a run with finite samples, got ")
+    assert f"status NOT_FINITE: {jb.describe(jb.Status.NOT_FINITE)}" in result.stderr
+
+
 def test_simulate_takes_belts_in_full(tmp_path):
     arguments = "--belt 0.3,steepness=8 --belt=-0.1,load=0.5 --damping 0.4 --omega 1.1 " + SPAN
     result = runner.invoke(app, ["simulate", *arguments.split(), "--out", str(tmp_path / "run")])

@@ -12,7 +12,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import oracle
 import pytest
+from scipy.integrate import solve_ivp
 
 import jaxbelt as jb
 from jaxbelt.model.oscillator import at_time, constant_force, has_clock
@@ -554,3 +556,167 @@ def test_impossible_numbers_in_a_trace_have_a_status():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert jax.jit(status)(jnp.nan) == jb.Status.NOT_FINITE
+
+
+# --- in a trace -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        dict(),
+        dict(forcing=(), velocity=jb.Oscillating(0.3, 0.2, 1.7)),
+        dict(forcing=jb.BaseMotion(0.4, 2.6), omega=2.0, load=0.3),
+        dict(forcing=Pulses(jnp.array(0.4), jnp.array(1.3))),
+    ],
+)
+def test_known_numbers_are_so_in_a_trace_too(changes):
+    osc = forced_one(**changes)
+
+    def run(y0, t1=5.0, **options):
+        return jb.simulate(osc, y0, t1, ts=jnp.array([2.0]), **options).ys
+
+    y0 = jax.ShapeDtypeStruct((2,), jnp.float64)
+    assert jax.eval_shape(run, y0).shape == (1, 2)
+    assert jax.eval_shape(partial(run, max_segments=100, max_events=30), y0).shape == (1, 2)
+    assert jax.eval_shape(run, y0, jax.ShapeDtypeStruct((), jnp.float64)).shape == (1, 2)
+    batch = jax.ShapeDtypeStruct((3, 2), jnp.float64)
+    assert jax.eval_shape(jax.vmap(run), batch).shape == (3, 1, 2)
+    slopes = jax.grad(lambda y: jnp.sum(run(y)))
+    assert jax.eval_shape(slopes, y0).shape == (2,)
+
+
+@pytest.mark.slow
+def test_compiled_runs_of_a_known_oscillator_are_those_outside():
+    osc, times = forced_one(), jnp.array([5.0])
+
+    def run(y0):
+        return jb.simulate(osc, y0, 5.0, ts=times).ys[-1]
+
+    starts = jnp.array([[1.0, 0.0], [1.5, 0.3]])
+    alone = jnp.stack([run(y0) for y0 in starts])
+    np.testing.assert_allclose(jax.jit(jax.vmap(run))(starts), alone, atol=1e-13)
+    slopes = jax.jit(jax.grad(lambda y: run(y)[0]))(starts[0])
+    np.testing.assert_allclose(slopes, jax.jacfwd(run)(starts[0])[0], atol=1e-12)
+
+
+# --- loads that oscillate, and edges --------------------------------------------------------------
+
+
+def edged(velocity, edge, amplitude, phase):
+    """A belt whose load oscillates, which touches on the right of an edge."""
+    load = jb.Oscillating(1.0, amplitude, 2.0, phase)
+    return jb.Oscillator(0.1, (jb.Belt(velocity, jb.Coulomb(1.0, 0.7), load, lower=edge),))
+
+
+def edged_of_engine(velocity, edge, amplitude, phase):
+    load = forced.Oscillating(1.0, amplitude, 2.0, phase)
+    belt = forced.Belt(velocity, ("coulomb", 1.0, 0.7), load, lower=edge)
+    return forced.Oscillator(0.1, (belt,))
+
+
+#: It passes the edge twice, and sticks and slips behind it.
+EDGED, EDGED_START, EDGED_SPAN = np.array([0.5, -1.0, 0.5, 0.3]), (3.0, 0.0), 10.0
+
+
+@jax.jit
+def edged_end(numbers):
+    return jb.simulate(edged(*numbers), EDGED_START, EDGED_SPAN, ts=jnp.array([EDGED_SPAN])).ys[-1]
+
+
+@pytest.mark.slow(first=True)
+def test_a_load_that_oscillates_acts_up_to_an_edge_as_in_scipy():
+    """From zone to zone; the belt is faster than the mass ever is."""
+    numbers = np.array([9.0, *EDGED[1:]])
+    edge, amplitude, phase = numbers[1:]
+
+    def field(touches):
+        def rate(t, y):
+            load = 1.0 + amplitude * cos(2.0 * t + phase)
+            return y[1], -y[0] - 0.1 * y[1] + touches * 0.7 * load
+
+        return rate
+
+    def passes(t, y):
+        return y[0] - edge
+
+    t, y, zones = 0.0, np.array(EDGED_START), 0
+    passes.terminal = True
+    while t < EDGED_SPAN:
+        touches = y[0] > edge or (y[0] == edge and y[1] > 0)
+        passes.direction = -1.0 if touches else 1.0
+        options = dict(events=passes, rtol=1e-12, atol=1e-13)
+        run = solve_ivp(field(touches), (t, EDGED_SPAN), y, "DOP853", **options)
+        t, y, zones = run.t[-1], run.y[:, -1], zones + 1
+        if t < EDGED_SPAN:
+            y[0] = edge
+    assert zones > 2
+    # Both are good to 1e-10 a step, or better.
+    np.testing.assert_allclose(edged_end(jnp.asarray(numbers)), y, atol=1e-9)
+
+
+@pytest.mark.slow(first=True)
+def test_derivatives_of_a_load_that_oscillates_up_to_an_edge():
+    found = np.asarray(jax.jacfwd(edged_end)(jnp.asarray(EDGED)))
+
+    def end(numbers):
+        run = forced.simulate(edged_of_engine(*map(float, numbers)), EDGED_START, EDGED_SPAN)
+        kinds = {kind for kind, _ in run.sequence}
+        assert kinds == {1, 2, 4}  # STICK, SLIP, EDGE
+        return np.array(run.y_end)
+
+    np.testing.assert_allclose(edged_end(jnp.asarray(EDGED)), end(EDGED), atol=CLOSE)
+    for k, column in enumerate(found.T):
+        one = np.eye(len(EDGED))[k]
+        slope, error = oracle.richardson(lambda h, one=one: end(EDGED + h * one), 0.0, 1e-3)
+        assert np.max(error) < 1e-8 and np.max(np.abs(slope)) > 0.1
+        np.testing.assert_allclose(column, slope, atol=1e-8)
+
+
+def two_edged(kind, wave, belt, law, edges, amplitude=0.5):
+    """Two belts end at one place, and either load is the larger one by turns."""
+    waves = wave(0.6, amplitude, 2.0, 0.3), wave(0.6, 0.4, 3.0, 2.0)
+    rows = zip((2.5, -2.3), waves, edges, strict=True)
+    return kind(0.1, tuple(belt(nu, law, load, upper=edge) for nu, load, edge in rows))
+
+
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("t1", [3.0, 9.0])
+def test_each_of_two_edges_at_one_place_has_its_own_derivative(t1):
+    own = partial(two_edged, jb.Oscillator, jb.Oscillating, jb.Belt, jb.Coulomb(0.8, 0.5))
+    law = ("coulomb", 0.8, 0.5)
+    other = partial(two_edged, forced.Oscillator, forced.Oscillating, forced.Belt, law)
+
+    def end(numbers):
+        first, second, amplitude = map(float, numbers)
+        osc = other((first, second), amplitude)
+        return np.array(forced.simulate(osc, (1.5, 0.0), t1).y_end)
+
+    at, names = np.array([0.2, 0.2, 0.5]), ("first", "second", "amplitude")
+    slopes = [
+        oracle.richardson(lambda h, one=one: end(at + h * one), 0.0, 1e-3)[0] for one in np.eye(3)
+    ]
+
+    @jax.jit
+    def run(numbers, t1):
+        return jb.simulate(own(numbers[:2], numbers[2]), (1.5, 0.0), t1, ts=t1[None]).ys[-1]
+
+    one, found = run(jnp.asarray(at), jnp.asarray(t1)), jax.jacfwd(run)
+    np.testing.assert_allclose(one, end(at), atol=CLOSE)
+    np.testing.assert_allclose(found(jnp.asarray(at), jnp.asarray(t1)).T, slopes, atol=1e-7)
+    swept = jb.sweep(
+        lambda first, second, amplitude: own((first, second), amplitude),
+        {name: [float(value)] for name, value in zip(names, at, strict=True)},
+        **dict(y0=(1.5, 0.0), t1=t1, rtol=1e-10, atol=1e-10, progress=False),
+    )
+    np.testing.assert_allclose([swept.x1_end.item(), swept.x2_end.item()], end(at), atol=CLOSE)
+
+
+@pytest.mark.slow(first=True)
+def test_a_cycle_of_a_load_that_oscillates_passes_an_edge():
+    numbers = np.array([-0.5, -0.2, 0.5, 0.3])
+    motion = jb.find_cycle(edged(*numbers), (3.0, 0.0))
+    assert motion.status == jb.Status.OK and "EDGE" in motion.signature
+    state = tuple(map(float, motion.start))
+    again = forced.simulate(edged_of_engine(*numbers), state, motion.periods * pi).y_end
+    np.testing.assert_allclose(again, state, atol=CLOSE)

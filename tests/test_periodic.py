@@ -64,6 +64,15 @@ def test_find_cycle_finds_the_number_of_periods(smooth, sticking):
 
 
 @pytest.mark.slow(first=True)
+def test_a_motion_at_a_known_oscillator_can_be_compiled(smooth):
+    """All is known in the trace, and what is computed is not."""
+    osc = bkn(1.7079)
+    start, status = jax.jit(lambda one: (one * smooth.at(osc).start, smooth.at(osc).status))(1.0)
+    assert status == OK
+    np.testing.assert_allclose(start, smooth.start, atol=1e-10)
+
+
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("frequency", [1.715, 1.725, 1.8])
 def test_the_number_of_periods_is_the_least(frequency):
     motion = jb.find_cycle(bkn(frequency), (0.5, 0.0))

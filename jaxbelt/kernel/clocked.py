@@ -156,7 +156,7 @@ def timed_window_of(osc: Oscillator, lanes: Lanes, *, extrema: Array | None = No
             hit = [flag & (place == edge) for flag, place in zip(flags, places, strict=True)]
             names = [jnp.asarray(n + i) for i in range(2 * n)]
             numbers.append(first_of(hit, names, jnp.asarray(-1)))
-            found.append(foremost(at_time(osc, lanes.t), hit, edges(osc), edge))
+            found.append(foremost(osc, hit, edges(osc), edge))
         found, numbers = tuple(found), tuple(numbers)
     return TimedWindow(mode.signs, stuck, ~lanes.done, most, found, numbers)
 

@@ -25,6 +25,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
+from .forcing import Oscillating
 from .oscillator import (
     MovingBelt,
     NoEdge,
@@ -93,12 +94,14 @@ def foremost(
 
     The values of these are equal, for their belts act at one place; the derivatives are then those
     of a belt that exerts a force. flags, values: one a belt, or one a belt several times over.
-    `default` where no flag is set.
+    `default` where no flag is set. A load that oscillates counts by its mean, so that the choice is
+    the same at all times.
     """
-    out, load = default, jnp.asarray(-jnp.inf)
-    belts = osc.belts * (len(flags) // len(osc.belts))
-    for belt, flag, value in zip(belts, flags, values, strict=True):
-        out, load = select(flag & (belt.load > load), (value, belt.load), (out, load))
+    out, largest = default, jnp.asarray(-jnp.inf)
+    loads = [b.load.mean if isinstance(b.load, Oscillating) else b.load for b in osc.belts]
+    loads = loads * (len(flags) // len(osc.belts))
+    for load, flag, value in zip(loads, flags, values, strict=True):
+        out, largest = select(flag & (load > largest), (value, load), (out, largest))
     return out
 
 
