@@ -144,8 +144,35 @@ def test_points_of_a_section_are_those_of_the_oracle(name):
         expected = np.array([[t, *motion(t)] for t in ups[:8]])
         for k, name in enumerate(("t", "x1", "x2")):
             np.testing.assert_allclose(found[name][i, 0, : len(expected)], expected[:, k], **CLOSE)
-        above = sum(downs) - sum(ups[: len(downs)])
+        above = sum(downs) + SPAN * (len(ups) > len(downs)) - sum(ups)
         np.testing.assert_allclose(found.above[i, 0], above, rtol=0, atol=1e-7)
+
+
+@pytest.mark.slow(first=True)
+def test_the_last_stay_above_a_section_ends_with_the_run():
+    end = 14.0
+    found = jb.sweep(*CASES["class_b"], y0=Y0, observe=Points(), **{**TIGHT, "t1": end})
+    ends_above = 0
+    for i, nu0 in enumerate(NU0):
+        motion = along(oracle.simulate(oracle.class_b(nu0, NU1), Y0, end))
+        passed = roots(lambda t, motion=motion: height(None, *motion(min(t, end))))
+        ups, downs = passed[::2], passed[1::2]
+        ends_above += len(ups) > len(downs)
+        above = sum(downs) + end * (len(ups) > len(downs)) - sum(ups)
+        np.testing.assert_allclose(found.above[i, 0], above, rtol=0, atol=1e-7)
+    assert 0 < ends_above
+
+
+@pytest.mark.slow(first=True)
+def test_what_is_fed_and_not_lost_is_gained_whatever_omega_is():
+    def make(velocity, omega=2.0):
+        return jb.Oscillator(0.5, (jb.Belt(velocity, jb.Conti(1.0, 0.6, 10.0), 0.5),), omega=omega)
+
+    found = jb.sweep(make, {"velocity": [0.3, -0.2]}, y0=Y0, observe=Energy(), **TIGHT)
+    ends = [jb.simulate(make(v), Y0, SPAN, ts=[SPAN], rtol=1e-12).ys[-1] for v in (0.3, -0.2)]
+    gained = [0.5 * float(y[0] ** 2 + y[1] ** 2) - 0.5 * 3.0**2 for y in ends]
+    np.testing.assert_allclose(found.gained, gained, **CLOSE)
+    np.testing.assert_allclose(found.fed - found.lost, gained, **CLOSE)
 
 
 @at_night
