@@ -70,12 +70,15 @@ def test_simulate_writes_what_simulate_returns(tmp_path):
 
 
 def test_the_last_sample_is_the_end_of_the_span_whatever_it_is(tmp_path):
-    """0.8 * 3 / 3 is larger than 0.8."""
-    out, arguments = str(tmp_path / "run"), "--class a --nu0 0.5 --t1 0.8 --samples 4"
+    end, steps = 41.6, 99
+    assert end * steps / steps > end
+    arguments = f"--class b --nu0 0.3 --nu1 0.4 --t1 {end} --samples {steps + 1}"
+    out = str(tmp_path / "run")
     result = runner.invoke(app, ["simulate", *arguments.split(), "--out", out])
     assert result.exit_code == 0, result.output
     t = column(read(tmp_path / "run.csv"), "t")
-    assert t[-1] == 0.8 and t == pytest.approx([0.0, 0.8 / 3, 1.6 / 3, 0.8], rel=1e-15)
+    assert t[-1] == end
+    np.testing.assert_allclose(t, np.arange(steps + 1) * (end / steps), rtol=1e-14)
 
 
 def test_a_run_of_which_nothing_is_known_tells_its_status(tmp_path):
