@@ -355,3 +355,104 @@ def test_a_forced_mass_at_rest_on_an_edge_is_an_equilibrium():
     assert np.all(found.status == jb.Status.PSEUDO_FOCUS)
     assert np.all(found.x1[..., 0] == 0.5) and np.all(np.isnan(found.x1[..., 1:]))
     assert len(found.table()) == 6 and np.all(found.table().x2 == 0)
+
+
+def two_forces(f2, phase=0.0, order=1):
+    """A mass that never comes to the belt's velocity: linear, pushed by friction of 0.5, too."""
+    forcing = (jb.Harmonic(1.0, 1.0), jb.Harmonic(0.5, f2, phase))[::order]
+    return jb.Oscillator(0.2, (jb.Belt(10.0, jb.Coulomb(0.5, 0.5)),), forcing=forcing)
+
+
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("phase", [0.0, np.pi])
+def test_forces_that_beat_slowly_have_no_cycle(phase):
+    """At the frequencies 1 and 1 + 1e-8 the strobes of the first force look alike, but the motion
+    beats between the amplitudes 7.5 and 2.5."""
+    found = jb.orbit_diagram(
+        lambda f2: two_forces(f2, phase), span=(1 + 1e-8, 1.5), y0=(0.0, 0.0), rows=2
+    )
+    assert found.kind[:, 0].tolist() == ["no period found", "cycle"]
+    assert np.isnan(found.period[0, 0]) and found.period[1, 0] == pytest.approx(4 * np.pi)
+
+
+def test_a_force_without_amplitude_has_no_say():
+    """Its frequency has no period in common with the other one's."""
+
+    def make(amplitude):
+        forcing = jb.Harmonic(1.0, 1.0), jb.Harmonic(amplitude, np.sqrt(2))
+        return jb.Oscillator(0.2, (jb.Belt(10.0, jb.Coulomb(0.5, 0.5)),), forcing=forcing)
+
+    found = module.varied(make, None, (0.0,), forced=True)
+    sampling = module.Sampling(found, jb.AtPhase(), np.zeros((1, 2)), 2, {})
+    period, turns = sampling._clocks(np.array([0.0, 0.1]))
+    assert period.tolist() == [2 * np.pi] * 2 and turns.tolist() == [1, 0]
+
+
+def test_what_seems_to_repeat_before_the_forces_do_is_not_taken_for_a_period():
+    still = np.ones((5, 64))
+    turns = module._turns_in(still, still, np.array([1, 2, 3, 33, 0]))
+    assert turns.tolist() == [1, 2, 3, 0, 0]
+
+
+class Seen(Exception):
+    """The end of a run that is not to be done."""
+
+
+def test_a_slow_second_force_makes_no_longer_runs(monkeypatch):
+    """They are 1,000 periods and 64 points long, of the first force."""
+
+    def results(grid, observer, states, which, t1, **numbers):
+        raise Seen(t1)
+
+    monkeypatch.setattr(module.Grid, "results", results)
+    for sense, periods in ((None, 1064), ("both", 564)):
+        options = dict(span=(1e-8, 1.0), y0=(0.0, 0.0), rows=2, sense=sense)
+        with pytest.raises(Seen) as caught:
+            jb.orbit_diagram(two_forces, **options)
+        assert 2 * np.pi * (periods - 1) < caught.value.args[0] < 2 * np.pi * periods
+
+
+def test_runs_that_end_apart_are_not_prolonged(monkeypatch):
+    """Each takes twice as long as it needs to, at most, and all are done."""
+
+    def results(grid, observer, states, which, t1, **numbers):
+        return {"row": which, "t1": np.full(len(which), t1)}
+
+    monkeypatch.setattr(module.Grid, "results", results)
+    variation = module.varied(two_forces, None, (1.0,), forced=True)
+    sampling = module.Sampling(variation, None, np.zeros((1, 2)), 5, {})
+    grid = module.Grid(two_forces, {"f2": np.ones(5)}, (0.0, 0.0))
+    ends = np.array([10.0, 11.0, 100.0, 5000.0, 5010.0])
+    for begin in (np.zeros(5), np.array([0.0, 0.0, 50.0, 4990.0, 5000.0])):
+        states = np.stack([np.zeros(5), np.zeros(5), begin])
+        found = sampling._results(grid, None, states, ends, np.arange(5))
+        assert found["row"].tolist() == [0, 1, 2, 3, 4]
+        assert np.all(found["t1"] >= ends)
+        assert np.all(found["t1"] - begin <= 2 * (ends - begin))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_force_of_frequency_0_beside_another_is_a_constant_one(order):
+    """x1 = 1 +- 5; at a frequency of 1 of both forces 0.5 +- 7.5."""
+
+    def make(f2):
+        return two_forces(f2, order=order)
+
+    found = jb.orbit_diagram(make, span=(0.0, 1.0), y0=(0.0, 0.0), rows=2)
+    assert np.all(found.kind == "cycle") and np.all(found.status == jb.Status.OK)
+    np.testing.assert_allclose(found.period, 2 * np.pi, rtol=1e-14)
+    # The force is largest at the strobe, and the mass is a quarter of a period behind it.
+    np.testing.assert_allclose(found.x1[:, 0, 0], [1.0, 0.5], atol=1e-7)
+    np.testing.assert_allclose(found.x2[:, 0, 0], [5.0, 7.5], atol=1e-7)
+    assert np.all(np.isnan(found.x1[..., 1:]))
+
+
+def test_a_span_without_a_clock_at_an_end():
+    def make(f):
+        forcing = jb.Harmonic(1.0, f), jb.Harmonic(0.5, 2 * f)
+        return jb.Oscillator(0.2, (jb.Belt(10.0, jb.Coulomb(0.5, 0.5)),), forcing=forcing)
+
+    for span in ((0.0, 1.0), (1.0, 0.0)):
+        with pytest.raises(ValueError, match="span must be"):
+            jb.orbit_diagram(make, span=span, rows=2)

@@ -11,6 +11,7 @@ import pytest
 import jaxbelt as jb
 from jaxbelt import Status
 from jaxbelt.kernel.clocked import timed_lanes_at_start
+from jaxbelt.model.oscillator import common_turns, repeating
 from jaxbelt.model.own_units import in_own_units
 from jaxbelt.sweeps.moments import Course
 from jaxbelt.sweeps.strobes import ForcedAttractor
@@ -196,6 +197,78 @@ def test_periods_are_those_that_all_frequencies_have_in_common():
     # Frequencies with no period in common have no periodic motion.
     found = jb.sweep(make, {"ratio": [np.sqrt(2)]}, y0=(0.5, 0.0), t1=3000.0, observe="attractor")
     assert jb.decoded(found).kind[0] != "periodic" and found.periods[0] == 0
+
+
+@pytest.mark.parametrize("unit", [1.0, 300.0, 1 / 300])
+@pytest.mark.parametrize(
+    ("waves", "turns"),
+    [
+        ((1, 0), 1),  # a constant force repeats always
+        ((0, 1), 1),
+        ((0, 0), 0),  # no clock at all
+        ((0, 1, 0.5, 0), 2),
+        ((1, 1), 1),
+        ((1, 1 / 2), 2),
+        ((1 / 2, 1), 1),
+        ((1, 2 / 3), 3),
+        ((1, 3 / 2), 2),
+        ((3 / 2, 1), 3),
+        ((1, 2), 1),
+        ((1, 33 / 32), 32),
+        ((33 / 32, 1), 33),
+        ((1, 1 / 33), 33),
+        ((1, np.sqrt(2)), 0),
+        ((1, 1 + 1e-8), 0),
+        ((1, np.nan), 0),  # what is not known to repeat
+    ],
+)
+def test_turns_after_which_all_waves_repeat(waves, turns, unit):
+    rates = [np.array([unit * one, 1.0]) for one in waves]
+    with np.errstate(invalid="ignore"):
+        assert common_turns(rates, np).tolist() == [turns, 1]
+    assert common_turns([jnp.asarray(one) for one in rates]).tolist() == [turns, 1]
+
+
+def linear(*forcing):
+    """Its mass never comes to the belt's velocity, and friction of 0.5 pushes it."""
+    return jb.Oscillator(0.2, (jb.Belt(10.0, jb.Coulomb(0.5, 0.5)),), forcing=forcing)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_force_whose_frequency_is_0_in_a_sweep_is_a_constant_one(order):
+    """x1 = 1 +- 5 there, 0.5 +- 7.5 at the frequency of the other force; a force that beats slowly
+    with it has no period."""
+
+    def make(f2):
+        return linear(*(jb.Harmonic(1.0, 1.0), jb.Harmonic(0.5, f2))[::order])
+
+    axes = {"f2": [0.0, 1.0, 1 + 1e-8]}
+    found = jb.sweep(make, axes, observe="attractor", t1=3000.0, y0=(0.0, 0.0))
+    assert jb.decoded(found).kind.values.tolist() == ["periodic", "periodic", "undecided"]
+    np.testing.assert_allclose(found.period[:2], 2 * np.pi, rtol=1e-14)
+    np.testing.assert_allclose(found.x1_min[:2], [-4.0, -7.0], atol=1e-5)
+    np.testing.assert_allclose(found.x1_max[:2], [6.0, 8.0], atol=1e-5)
+    motion = jb.find_cycle(make(0.0), (0.0, 0.0))
+    assert motion.periods == found.periods[0] == 1
+    np.testing.assert_allclose([motion.x1_min, motion.x1_max], [-4.0, 6.0], rtol=1e-12)
+
+
+class Ramp(jb.AbstractForce):
+    """Never repeats."""
+
+    size: jax.Array
+    frequency: jax.Array
+
+    def force(self, t):
+        return self.size * jnp.tanh(1e-6 * t)
+
+
+def test_of_a_force_of_ones_own_without_a_frequency_nothing_is_known():
+    osc = linear(jb.Harmonic(1.0, 1.0), Ramp(jnp.array(0.5), jnp.array(0.0)))
+    assert common_turns(repeating(osc)) == 0
+    with pytest.raises(ValueError, match="osc must be such that all its frequencies have a period"):
+        jb.find_cycle(osc, (0.0, 0.0))
 
 
 @pytest.mark.slow(first=True)

@@ -37,7 +37,14 @@ from ..model.instants import (
     trend_of,
 )
 from ..model.modes import capacity, mode_acceleration, mode_of, select, stick_velocity
-from ..model.oscillator import Oscillator, at_time, frequencies
+from ..model.oscillator import (
+    RATIOS,
+    Oscillator,
+    at_time,
+    clock,
+    common_turns,
+    frequencies,
+)
 from ..motion.arcs import Ends
 from ..numerics.compiling import any_lane, jit, power_of_two
 from ..numerics.implicit import Equations, step_to_root
@@ -68,10 +75,6 @@ from .shooting import (
 TIMED_STRIDE = 0.25
 #: The smallest mesh of an arc; steps by which steps are placed, for each that an arc may have.
 LEAST_STEPS, PLACING = 8 * ARC_STEPS, 2
-#: A common period has so many periods of the slowest wave at most.
-RATIOS = 64
-#: Rounding of a ratio of two frequencies.
-RATIO_ROUNDING = 1e-14
 #: A boundary or limit that is passed by less is touched.
 TOUCHES_AGAIN = 1e-8
 #: A guard that rises faster where an arc ends has been zero before.
@@ -81,7 +84,7 @@ EXTREMUM_STEPS = 2
 
 
 class TimedChain(Chain):
-    """A chain of whole periods; turns: periods of the first wave in one of all that knows the time;
+    """A chain of whole periods; turns: periods of the `clock` in one of all that knows the time;
     share: where in a period it begins, in [0, 1); None: at the phase 0."""
 
     turns: int = eqx.field(static=True, kw_only=True)
@@ -89,25 +92,23 @@ class TimedChain(Chain):
 
 
 def turns_of(osc: Oscillator) -> int:
-    """How many periods of the first wave, in the order of `frequencies`, are one of all waves.
+    """`common_turns` of a known oscillator; `ValueError` where there is no common period.
 
-    `ValueError` where they have none in common, see `RATIOS`.
+    A frequency 0 is that of a user's force, or one by which derivatives are taken: none there, as a
+    force that is known to be constant is no wave.
     """
-    found = np.array([float(one) for one in lax.stop_gradient(frequencies(osc))])
-    ratios = np.abs(found / np.min(np.abs(found)))
-    passed = np.arange(1, RATIOS + 1)[:, None] * ratios
-    whole = np.abs(passed - np.round(passed)) <= RATIO_ROUNDING * passed
-    common = np.flatnonzero(np.all(whole, axis=1))
+    found = [float(one) for one in lax.stop_gradient(frequencies(osc))]
+    rates = [np.float64(one or np.nan) for one in found]
+    with np.errstate(all="ignore"):
+        turns = round(float(common_turns(rates, np)))
     expected = f"a period in common, of {RATIOS} periods of the slowest at most"
-    require(
-        common.size > 0, "osc", f"such that all its frequencies have {expected}", found.tolist()
-    )
-    return round(passed[common[0], 0])
+    require(turns > 0, "osc", f"such that all its frequencies have {expected}", found)
+    return turns
 
 
 def forcing_period(osc: Oscillator, turns: int) -> Array:
     """The period of all that knows the time."""
-    return 2 * jnp.pi * turns / frequencies(osc)[0]
+    return 2 * jnp.pi * turns / clock(osc)
 
 
 # --- the mesh -------------------------------------------------------------------------------------

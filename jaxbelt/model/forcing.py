@@ -58,7 +58,8 @@ class AbstractForce(_Wave):
     """A periodic force on the mass: subclass it with `frequency` and `force` to define your own.
 
     Attributes:
-        frequency: Angular frequency in the time tau; the period is 2 pi / frequency.
+        frequency: Angular frequency in the time tau; the period is 2 pi / frequency. 0: none is
+            known.
 
     Example:
         A short push in each period::
@@ -324,6 +325,19 @@ def unchecked(kind: type, /, **fields: Any) -> Any:
     for name, value in fields.items():
         object.__setattr__(made, name, value)
     return made
+
+
+def rate_of_repeats(wave: Any) -> Array:
+    """The frequency with which a wave is known to repeat, 0 where it is constant; nan where that of
+    a user's force is 0: it may be anything."""
+    known = isinstance(wave, _Sinusoid | Oscillating)
+    return wave.frequency if known else jnp.where(wave.frequency == 0, jnp.nan, wave.frequency)
+
+
+def has_amplitude(wave: Any) -> Array:
+    """Whether a wave may be more than a constant, whatever its frequency is."""
+    known = isinstance(wave, _Sinusoid | Oscillating)
+    return wave.amplitude != 0 if known else jnp.asarray(True)
 
 
 def _is_zero(value: Any) -> bool:

@@ -26,7 +26,7 @@ gives that one, and everything that asks for forces, guards or modes at an insta
 
 import functools
 import operator
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -60,9 +60,15 @@ from .forcing import (
     as_forcing,
     as_load,
     as_velocity,
+    rate_of_repeats,
     unchecked,
 )
 from .friction import AbstractFriction, as_friction
+
+#: A common period has so many periods of the slowest wave at most.
+RATIOS = 64
+#: Rounding of a ratio of two frequencies.
+RATIO_ROUNDING = 1e-14
 
 
 @jax.custom_jvp
@@ -297,6 +303,40 @@ def waves_of(osc: Oscillator) -> list[Any]:
 def frequencies(osc: Oscillator) -> list[Array]:
     """Angular frequencies of all that knows the time, as in `waves_of`."""
     return [wave.frequency for wave in waves_of(osc)]
+
+
+def clock(osc: Oscillator) -> Array:
+    """Frequency by which periods are counted: of the first of `waves_of` where it is not 0."""
+    return _first_not_zero(frequencies(osc))
+
+
+def _first_not_zero(numbers: Sequence[Any], xp: Any = jnp) -> Any:
+    return functools.reduce(lambda after, one: xp.where(one == 0, after, one), reversed(numbers))
+
+
+def repeating(osc: Oscillator) -> list[Array]:
+    """Frequencies with which what knows the time repeats, as `rate_of_repeats`, see
+    `common_turns`."""
+    return [rate_of_repeats(wave) for wave in waves_of(osc)]
+
+
+def common_turns(rates: Sequence[Any], xp: Any = jnp) -> Any:
+    """How many periods of the clock are one of all waves, by their `repeating` rates, arrays of one
+    shape, of NumPy or JAX as `xp` says; 0 where they have none in common, see `RATIOS`.
+
+    A wave that is constant, of the rate 0, repeats always.
+    """
+    found = [xp.abs(one) for one in rates]
+    slowest = functools.reduce(xp.minimum, [xp.where(one == 0, xp.inf, one) for one in found])
+    ratios = [one / slowest for one in found]
+    count = xp.arange(1, RATIOS + 1, dtype=slowest.dtype).reshape((1,) * slowest.ndim + (RATIOS,))
+    whole = xp.ones((*slowest.shape, RATIOS), bool)
+    for ratio in ratios:
+        passed = count * ratio[..., None]
+        whole = whole & (xp.abs(passed - xp.round(passed)) <= RATIO_ROUNDING * passed)
+    first = (1 + xp.argmax(whole, axis=-1)).astype(slowest.dtype)
+    turns = xp.round(first * _first_not_zero(ratios, xp))
+    return xp.where(xp.any(whole, axis=-1), turns, 0.0)
 
 
 def fastest(osc: Oscillator) -> Array:

@@ -20,7 +20,7 @@ from jaxtyping import Array
 from ..checks import as_array, require, require_callable, require_one_of, require_value
 from ..model.forcing import Oscillating
 from ..model.modes import Mode, mode_acceleration, without_rounding
-from ..model.oscillator import Oscillator, frequencies, has_clock
+from ..model.oscillator import Oscillator, clock, has_clock
 from ..numerics.polynomials import derivative, polynomial, quintic
 from .observers import as_given
 
@@ -104,8 +104,8 @@ class AtPhase:
     """Once in each period of the forcing: a stroboscopic section.
 
     The moments are the times t at which Omega t is the phase up to whole turns, Omega the frequency
-    of the first force, or, without forces, of the first velocity or load that oscillates. So the
-    phase 0 is at t = 0.
+    of the first force whose frequency is not 0, or, without one, of the first velocity or load that
+    oscillates. So the phase 0 is at t = 0.
 
     Attributes:
         phase: An angle.
@@ -123,12 +123,12 @@ class AtPhase:
 
     def next_time(self, osc: Oscillator, passed: Array) -> Array:
         """The time of the moment that so many are before, counted from the turn of t = 0 on."""
-        frequency = frequencies(osc)[0]
+        frequency = clock(osc)
         return (self.phase + 2 * np.pi * passed.astype(frequency.dtype)) / frequency
 
     def passed_at(self, osc: Oscillator, t: Array, count: Array) -> Array:
         """The number of the first moment at t or later, as numbers like `count`."""
-        turns = (frequencies(osc)[0] * t - self.phase) / (2 * np.pi)
+        turns = (clock(osc) * t - self.phase) / (2 * np.pi)
         return jnp.ceil(turns - 1e-12 * (1 + jnp.abs(turns))).astype(count.dtype)
 
 

@@ -10,6 +10,7 @@ Where each value begins from what the one before has led to, as in an experiment
 one value after the other, in a kernel of few lanes.
 """
 
+import functools
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -28,12 +29,14 @@ from ..checks import (
     as_tolerance,
     as_whole,
     outside_of_traces,
+    require,
     require_one_of,
     require_value,
 )
 from ..cycles.attractors import RUN
-from ..model.oscillator import Oscillator, frequencies, has_clock
-from ..model.variations import Variation, as_span, varied
+from ..model.forcing import has_amplitude
+from ..model.oscillator import Oscillator, clock, common_turns, has_clock, repeating, waves_of
+from ..model.variations import WITH_A_CLOCK, Variation, as_span, varied
 from ..numerics.spacing import evenly_spaced
 from ..results import Status, draw
 from ..tables import table_of
@@ -43,7 +46,7 @@ from .grid import Grid
 from .moments import AtEvents, AtExtrema, AtPhase, AtSection
 from .question import LONG_ENOUGH
 from .reducers import check_sections
-from .strobes import SAME, common_turns
+from .strobes import SAME
 
 if TYPE_CHECKING:
     import pandas
@@ -214,9 +217,10 @@ def orbit_diagram(
     if sense is not None:
         require_one_of(sense, tuple(SENSES), "sense")
         require_value(len(starts) == 1, "y0", "one start where sense is given", y0)
-    example, other = (variation.oscillator(np.array([value])) for value in (first, last))
-    if has_clock(example) or has_clock(other):
-        variation.check_clock((first, last))
+    # A force of a frequency that is known to be 0 is a constant one, without a clock.
+    ends = [variation.oscillator(np.array([value])) for value in (first, last)]
+    example = max(ends, key=has_clock)
+    if has_clock(example):
         at = AtPhase() if at is None else at
         require_value(isinstance(at, AtPhase), "at", "an AtPhase, as osc is forced", at)
     else:
@@ -263,9 +267,9 @@ class Sampling:
         values = evenly_spaced(first, last, self.rows)
         grid = Grid(self._make, {"parameter": values}, (0.0, 0.0))
         if isinstance(self.at, AtPhase):
-            self.variation.check_clock((first, last))
             return self._strobed(grid, values)
-        found = self._from_starts(grid, Attractor(), _beside_attractor(grid), LONG_ENOUGH)
+        ends = functools.partial(np.full_like, fill_value=LONG_ENOUGH, dtype=float)
+        found = self._from_starts(grid, Attractor(), _beside_attractor(grid), ends)
         # Codes of runs that are not finite are NaN.
         kind = np.nan_to_num(found["kind"]).astype(int)
         status = found["status"].astype(int)
@@ -302,34 +306,34 @@ class Sampling:
 
     def _strobed(self, grid: Grid, values: np.ndarray) -> OrbitDiagram:
         """The diagram of a stroboscopic section: STROBES points behind PERIODS_LEFT_OUT periods."""
-        waves = np.array([frequencies(self._make(value)) for value in values], dtype=float).T
-        waves = np.repeat(waves, len(self.starts), axis=1)
-        period = 2 * np.pi / waves[0]
+        period, turns = (np.repeat(one, len(self.starts)) for one in self._clocks(values))
         left_out = PERIODS_LEFT_OUT_BESIDE if self.senses else PERIODS_LEFT_OUT
         reducer = _KeptMoments((self.at,), STROBES, ("x1", "x2"), left_out)
         off = OFF_ATTRACTOR * grid.length()
+        share = self.at.phase / (2 * np.pi)
         # Where all waves together have a period, runs go on at the time in it that others came to.
-        turns = np.asarray(common_turns(list(jnp.asarray(waves)), jnp.zeros(period.size, int)))
-        turns = np.maximum(turns, 1)
-        # No moment is at t1, where rounding decides whether it counts.
-        t1 = float(np.max(period)) * (left_out + STROBES + int(np.max(turns)) + 0.5)
-        passed = np.full(period.size, int(np.ceil(-self.at.phase / (2 * np.pi) - 1e-12)))
+        cycle = np.maximum(turns, 1)
+        passed = np.full(period.size, np.ceil(-share - 1e-12))
+
+        def ends(which):
+            """Half a period behind the last moment: at a moment rounding decides whether it
+            counts."""
+            return (share + passed[which] + left_out + STROBES - 0.5) * period[which]
 
         def further(found, which, following):
             *state, last = reducer.last_state(found)
-            passed[following] = (passed[which] + left_out + last) % turns[following]
-            times = (self.at.phase / (2 * np.pi) + passed[following]) * period[following]
+            passed[following] = (passed[which] + left_out + last) % cycle[following]
+            times = (share + passed[following]) * period[following]
             rests = _have_come_to_rest(found)
             away = np.where(found["status"] == Status.STUCK_FOREVER, 0, off)
             ends = (np.where(rests, found[at], x) for at, x in zip(ENDS_AT, state, strict=True))
             return np.stack([*(x + away for x in ends), times])
 
-        found = self._from_starts(grid, Along(reducer), further, t1, t0=0.0)
+        found = self._from_starts(grid, Along(reducer), further, ends, t0=0.0)
         x1, x2 = reducer.columns(found)
-        # Runs of other frequencies may have a period less.
         status = found["status"].astype(int)
         x1[status != Status.OK], x2[status != Status.OK] = np.nan, np.nan
-        turns = _turns_in(x1, x2)
+        turns = _turns_in(x1, x2, turns)
         kind = np.where(turns > 0, KINDS[CYCLE], NOT_PERIODIC)
         kind = np.where(status == Status.OK, kind, KINDS[UNDECIDED])
         for at_rest, code in RESTS.items():
@@ -341,6 +345,22 @@ class Sampling:
         period = np.where(turns > 0, turns * period, np.nan)
         return self._diagram(values, kind, period, status, x1, x2)
 
+    def _clocks(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The period of the clock at each value, and its `common_turns`."""
+        made = self.variation.oscillators(values[:, None])
+
+        def row(number):
+            return np.broadcast_to(np.asarray(number, float), values.shape)
+
+        frequency = row(clock(made))
+        fine = np.all((frequency > 0) & np.isfinite(frequency))
+        require(fine, "span", WITH_A_CLOCK, (float(values[0]), float(values[-1])))
+        pairs = zip(map(row, repeating(made)), map(row, map(has_amplitude, waves_of(made))))
+        # What has no amplitude repeats always; but strobes are at the periods of the clock.
+        rates = [np.where((size > 0) | (rate == frequency), rate, 0.0) for rate, size in pairs]
+        with np.errstate(all="ignore"):
+            return 2 * np.pi / frequency, common_turns(rates, np)
+
     def _make(self, parameter: Any) -> Oscillator:
         return self.variation.make(parameter)
 
@@ -349,30 +369,41 @@ class Sampling:
         grid: Grid,
         observer: Any,
         states: np.ndarray,
-        t1: float,
-        which: Any = None,
+        ends: np.ndarray,
+        which: np.ndarray,
         **numbers: Any,
     ) -> dict[str, np.ndarray]:
-        """Results of an observer for runs from states, [2, runs]; which: their numbers, or all;
-        numbers: more of `threads.run`."""
-        which = np.arange(states.shape[1]) if which is None else which
-        numbers |= {"t1": t1, **self.numbers}
-        return grid.results(observer, states, which // len(self.starts), **numbers)
+        """Results of an observer for runs from states, [2 or 3, runs], that go on until `ends` at
+        least; which: their numbers; numbers: more of `threads.run`."""
+        numbers |= self.numbers
+        begin = states[2] if len(states) == 3 else np.zeros(len(ends))
+        found, left = {}, np.arange(len(ends))
+        # Runs that end together take twice as long as they need to, at most.
+        while left.size:
+            t1 = float(np.max(ends[left]))
+            alike = t1 - begin[left] <= 2 * (ends - begin)[left]
+            here, left = left[alike], left[~alike]
+            rows = which[here] // len(self.starts)
+            results = grid.results(observer, states[:, here], rows, t1=t1, **numbers)
+            _put(found, here, results, len(ends))
+        return found
 
     def _from_starts(
         self,
         grid: Grid,
         observer: Any,
         further: Callable[[dict[str, np.ndarray], np.ndarray, np.ndarray], np.ndarray],
-        t1: float,
+        ends: Callable[[np.ndarray], np.ndarray],
         **numbers: Any,
     ) -> dict[str, np.ndarray]:
-        """Results of an observer for all runs. Where the parameter changes in some sense,
-        `further` says of results, and of the numbers of these runs and the following ones, where
-        the latter begin, [2 or 3, runs], see `Grid.results`; NaN: where the former did."""
+        """Results of an observer for all runs; ends: when runs end, by their numbers. Where the
+        parameter changes in some sense, `further` says of results, and of the numbers of these runs
+        and the following ones, where the latter begin, [2 or 3, runs], see `Grid.results`; NaN:
+        where the former did."""
         if not self.senses:
             states = np.tile(self.starts.T, self.rows)
-            return self._results(grid, observer, states, t1, **numbers)
+            which = np.arange(states.shape[1])
+            return self._results(grid, observer, states, ends(which), which, **numbers)
         lanes, found = np.arange(len(self.senses)), {}
         rows = [
             np.array([i if sense == "up" else self.rows - 1 - i for sense in self.senses])
@@ -385,10 +416,8 @@ class Sampling:
         for i, which in enumerate(runs):
             note_progress(f"{i} of {self.rows} values")
             few = {"width": LANES_OF_FEW, **numbers}
-            results = self._results(grid, observer, states, t1, which, **few)
-            for name, values in results.items():
-                shape = self.rows * len(lanes), *values.shape[1:]
-                found.setdefault(name, np.full(shape, np.nan))[which] = values
+            results = self._results(grid, observer, states, ends(which), which, **few)
+            _put(found, which, results, self.rows * len(lanes))
             following = runs[min(i + 1, self.rows - 1)]
             ahead = further(results, which, following)
             states = np.where(np.isfinite(ahead), ahead, states)
@@ -428,7 +457,8 @@ class Sampling:
         state, began = np.stack([x1_max, np.zeros_like(x1_max)]), np.zeros_like(x1_max)
         remaining = np.arange(len(which))
         for _ in range(MOST_RUNS):
-            until = float(np.max((end - began)[remaining])) * (1 + OUTSIDE)
+            until = np.max((end - began)[remaining]) * (1 + OUTSIDE)
+            until = np.full(len(remaining), until)
             left = state[:, remaining], until, which[remaining]
             new = np.stack(reducer.columns(self._results(grid, Along(reducer), *left)))
             new[0] += began[remaining, None]
@@ -465,18 +495,32 @@ def _beside_attractor(grid: Grid) -> Callable[..., np.ndarray]:
     return state
 
 
+def _put(
+    found: dict[str, np.ndarray], which: np.ndarray, results: dict[str, np.ndarray], size: int
+) -> None:
+    """Puts results of runs, by their numbers, into columns of so many."""
+    for name, values in results.items():
+        missing = np.full((size, *values.shape[1:]), np.nan)
+        found.setdefault(name, missing)[which] = values
+
+
 def _have_come_to_rest(found: dict[str, np.ndarray]) -> np.ndarray:
     """Which forced runs have come to rest, by their results."""
     return np.isin(found["status"], list(RESTS))
 
 
-def _turns_in(x1: np.ndarray, x2: np.ndarray) -> np.ndarray:
-    """After how many points rows of them repeat, all of them, half as many at most; 0: not."""
+def _turns_in(x1: np.ndarray, x2: np.ndarray, common: np.ndarray) -> np.ndarray:
+    """After how many points rows of them repeat, all of them, half as many at most; 0: not.
+
+    common: points after which what pushes repeats, 0: never; a motion repeats after as many, or a
+    multiple: what seems to repeat before does not, where waves beat slowly.
+    """
     turns = np.zeros(len(x1), dtype=int)
     sizes = [SAME * (np.ptp(x, axis=1) + np.max(np.abs(x), axis=1)) for x in (x1, x2)]
     for n in reversed(range(1, x1.shape[1] // 2 + 1)):
         away = [np.max(np.abs(x[:, n:] - x[:, :-n]), axis=1) for x in (x1, x2)]
-        turns[(away[0] <= sizes[0]) & (away[1] <= sizes[1])] = n
+        pushed_alike = (common > 0) & (n % np.maximum(common, 1) == 0)
+        turns[pushed_alike & (away[0] <= sizes[0]) & (away[1] <= sizes[1])] = n
     return turns
 
 

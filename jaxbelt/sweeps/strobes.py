@@ -6,8 +6,7 @@ and ends a run as soon as it knows one. Where there is none until the end of the
 exponent decides.
 """
 
-import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
@@ -16,11 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..cycles.clocked import RATIO_ROUNDING, RATIOS
 from ..cycles.settling import way_left
 from ..kernel.lanes import Lanes, Observer, Variable, choose, materialise
 from ..model.instants import blur
-from ..model.oscillator import frequencies
+from ..model.oscillator import clock, common_turns, repeating
 from ..model.own_units import OwnOscillator
 from ..numerics.implicit import step_to_root
 from ..results import Status
@@ -131,8 +129,8 @@ class _Extent(eqx.Module):
 class _RunSoFar(eqx.Module):
     """Memory of the observers, arrays [lanes].
 
-    strobes: number of the next strobe, counted from t = 0; turns: of the first force from one to
-    the next, 0: the frequencies have no period in common. farthest: largest distance from the
+    strobes: number of the next strobe, counted from t = 0; turns: of the `clock` from one to the
+    next, 0: the frequencies have no period in common. farthest: largest distance from the
     origin in each half of the time in which exponents are measured. kind, periods, loop_events,
     loop_rises: of the attractor, once known; transient: the time when it was.
     """
@@ -185,7 +183,8 @@ class ForcedAttractor(Observer):
 
     def start(self, osc, lanes):
         zero, count = jnp.zeros_like(lanes.t), jnp.zeros_like(lanes.events)
-        turns = common_turns(frequencies(osc), count)
+        rates = [jnp.broadcast_to(one, count.shape) for one in repeating(osc)]
+        turns = common_turns(rates).astype(count.dtype)
         passed = jnp.floor(lanes.t / _strobe_period(osc, turns) * (1 + 1e-14) + 1e-12)
         nowhere, never = zero + jnp.nan, jnp.full_like(count, -1)
         patience = count + FIRST_PATIENCE
@@ -440,25 +439,10 @@ class ForcedAttractor(Observer):
         }
 
 
-def common_turns(waves: Sequence[Array], none: Array) -> Array:
-    """As `turns_of`, by the frequencies, of each lane, as numbers like `none`, its 0 where there is
-    no such period."""
-    found = [jnp.abs(jnp.broadcast_to(one, none.shape)) for one in waves]
-    slowest = functools.reduce(jnp.minimum, found)
-    ratios = [one / slowest for one in found]
-    count = jnp.arange(1, RATIOS + 1, dtype=slowest.dtype).reshape((1,) * none.ndim + (RATIOS,))
-    whole = jnp.ones((*none.shape, RATIOS), bool)
-    for ratio in ratios:
-        passed = count * ratio[..., None]
-        whole = whole & (jnp.abs(passed - jnp.round(passed)) <= RATIO_ROUNDING * passed)
-    turns = jnp.round((1 + jnp.argmax(whole, axis=-1)).astype(slowest.dtype) * ratios[0])
-    return jnp.where(jnp.any(whole, axis=-1), turns, 0).astype(none.dtype)
-
-
 def _strobe_period(osc: OwnOscillator, turns: Array) -> Array:
     """Time between two strobes; a turn where there is no period."""
-    first = jnp.abs(frequencies(osc)[0])
-    return 2 * np.pi * jnp.maximum(turns, 1).astype(first.dtype) / first
+    frequency = jnp.abs(clock(osc))
+    return 2 * np.pi * jnp.maximum(turns, 1).astype(frequency.dtype) / frequency
 
 
 def _way_to_zero(value: Array, slope: Array, h: Array) -> Array:
