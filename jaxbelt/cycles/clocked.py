@@ -41,7 +41,7 @@ from ..model.oscillator import (
     RATIOS,
     Oscillator,
     at_time,
-    clock,
+    clock_frequency,
     common_turns,
     frequencies,
 )
@@ -84,7 +84,7 @@ EXTREMUM_STEPS = 2
 
 
 class TimedChain(Chain):
-    """A chain of whole periods; turns: periods of the `clock` in one of all that knows the time;
+    """A chain of whole periods; turns: `common_turns` of all that knows the time;
     share: where in a period it begins, in [0, 1); None: at the phase 0."""
 
     turns: int = eqx.field(static=True, kw_only=True)
@@ -108,7 +108,7 @@ def turns_of(osc: Oscillator) -> int:
 
 def forcing_period(osc: Oscillator, turns: int) -> Array:
     """The period of all that knows the time."""
-    return 2 * jnp.pi * turns / clock(osc)
+    return 2 * jnp.pi * turns / clock_frequency(osc)
 
 
 # --- the mesh -------------------------------------------------------------------------------------

@@ -305,7 +305,7 @@ def frequencies(osc: Oscillator) -> list[Array]:
     return [wave.frequency for wave in waves_of(osc)]
 
 
-def clock(osc: Oscillator) -> Array:
+def clock_frequency(osc: Oscillator) -> Array:
     """Frequency by which periods are counted: of the first of `waves_of` where it is not 0."""
     return _first_not_zero(frequencies(osc))
 

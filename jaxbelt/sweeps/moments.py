@@ -20,7 +20,7 @@ from jaxtyping import Array
 from ..checks import as_array, require, require_callable, require_one_of, require_value
 from ..model.forcing import Oscillating
 from ..model.modes import Mode, mode_acceleration, without_rounding
-from ..model.oscillator import Oscillator, clock, has_clock
+from ..model.oscillator import Oscillator, clock_frequency, has_clock
 from ..numerics.polynomials import derivative, polynomial, quintic
 from .observers import as_given
 
@@ -123,12 +123,12 @@ class AtPhase:
 
     def next_time(self, osc: Oscillator, passed: Array) -> Array:
         """The time of the moment that so many are before, counted from the turn of t = 0 on."""
-        frequency = clock(osc)
+        frequency = clock_frequency(osc)
         return (self.phase + 2 * np.pi * passed.astype(frequency.dtype)) / frequency
 
     def passed_at(self, osc: Oscillator, t: Array, count: Array) -> Array:
         """The number of the first moment at t or later, as numbers like `count`."""
-        turns = (clock(osc) * t - self.phase) / (2 * np.pi)
+        turns = (clock_frequency(osc) * t - self.phase) / (2 * np.pi)
         return jnp.ceil(turns - 1e-12 * (1 + jnp.abs(turns))).astype(count.dtype)
 
 

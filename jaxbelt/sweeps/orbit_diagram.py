@@ -35,7 +35,14 @@ from ..checks import (
 )
 from ..cycles.attractors import RUN
 from ..model.forcing import has_amplitude
-from ..model.oscillator import Oscillator, clock, common_turns, has_clock, repeating, waves_of
+from ..model.oscillator import (
+    Oscillator,
+    clock_frequency,
+    common_turns,
+    has_clock,
+    repeating,
+    waves_of,
+)
 from ..model.variations import WITH_A_CLOCK, Variation, as_span, varied
 from ..numerics.spacing import evenly_spaced
 from ..results import Status, draw
@@ -352,7 +359,7 @@ class Sampling:
         def row(number):
             return np.broadcast_to(np.asarray(number, float), values.shape)
 
-        frequency = row(clock(made))
+        frequency = row(clock_frequency(made))
         fine = np.all((frequency > 0) & np.isfinite(frequency))
         require(fine, "span", WITH_A_CLOCK, (float(values[0]), float(values[-1])))
         pairs = zip(map(row, repeating(made)), map(row, map(has_amplitude, waves_of(made))))
@@ -385,7 +392,7 @@ class Sampling:
             here, left = left[alike], left[~alike]
             rows = which[here] // len(self.starts)
             results = grid.results(observer, states[:, here], rows, t1=t1, **numbers)
-            _put(found, here, results, len(ends))
+            _fill_in(found, here, results, len(ends))
         return found
 
     def _from_starts(
@@ -417,7 +424,7 @@ class Sampling:
             note_progress(f"{i} of {self.rows} values")
             few = {"width": LANES_OF_FEW, **numbers}
             results = self._results(grid, observer, states, ends(which), which, **few)
-            _put(found, which, results, self.rows * len(lanes))
+            _fill_in(found, which, results, self.rows * len(lanes))
             following = runs[min(i + 1, self.rows - 1)]
             ahead = further(results, which, following)
             states = np.where(np.isfinite(ahead), ahead, states)
@@ -495,7 +502,7 @@ def _beside_attractor(grid: Grid) -> Callable[..., np.ndarray]:
     return state
 
 
-def _put(
+def _fill_in(
     found: dict[str, np.ndarray], which: np.ndarray, results: dict[str, np.ndarray], size: int
 ) -> None:
     """Puts results of runs, by their numbers, into columns of so many."""

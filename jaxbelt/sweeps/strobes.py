@@ -18,7 +18,7 @@ from jaxtyping import Array
 from ..cycles.settling import way_left
 from ..kernel.lanes import Lanes, Observer, Variable, choose, materialise
 from ..model.instants import blur
-from ..model.oscillator import clock, common_turns, repeating
+from ..model.oscillator import clock_frequency, common_turns, repeating
 from ..model.own_units import OwnOscillator
 from ..numerics.implicit import step_to_root
 from ..results import Status
@@ -129,8 +129,8 @@ class _Extent(eqx.Module):
 class _RunSoFar(eqx.Module):
     """Memory of the observers, arrays [lanes].
 
-    strobes: number of the next strobe, counted from t = 0; turns: of the `clock` from one to the
-    next, 0: the frequencies have no period in common. farthest: largest distance from the
+    strobes: number of the next strobe, counted from t = 0; turns: `common_turns` from one to the next,
+    0: the frequencies have no period in common. farthest: largest distance from the
     origin in each half of the time in which exponents are measured. kind, periods, loop_events,
     loop_rises: of the attractor, once known; transient: the time when it was.
     """
@@ -441,7 +441,7 @@ class ForcedAttractor(Observer):
 
 def _strobe_period(osc: OwnOscillator, turns: Array) -> Array:
     """Time between two strobes; a turn where there is no period."""
-    frequency = jnp.abs(clock(osc))
+    frequency = jnp.abs(clock_frequency(osc))
     return 2 * np.pi * jnp.maximum(turns, 1).astype(frequency.dtype) / frequency
 
 
