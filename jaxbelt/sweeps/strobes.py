@@ -129,7 +129,7 @@ class _Extent(eqx.Module):
 class _RunSoFar(eqx.Module):
     """Memory of the observers, arrays [lanes].
 
-    strobes: number of the next strobe, counted from t = 0; turns: `common_turns` from one to the next,
+    strobes: number of the next strobe, counted from t = 0; turns: `common_turns` between two,
     0: the frequencies have no period in common. farthest: largest distance from the
     origin in each half of the time in which exponents are measured. kind, periods, loop_events,
     loop_rises: of the attractor, once known; transient: the time when it was.
