@@ -362,11 +362,10 @@ def _create(path: Path, question: Question) -> None:
         }
     )
     _consolidate(new)
-    if not path.exists():
+    if not (path.exists() and path.samefile(Path.cwd())):
         os.replace(new, path)
         return
-    # A folder that is there stays, as it may be someone's working folder. What makes it a store
-    # comes last.
+    # The working folder has to stay. What makes it a store comes last.
     for part in sorted(new.iterdir(), key=lambda part: part.name == "zarr.json"):
         os.replace(part, path / part.name)
     new.rmdir()
