@@ -75,6 +75,42 @@ def test_an_edge_at_which_one_belt_ends_and_another_begins_is_one_of_both():
         assert float(point.value) == pytest.approx(expected, abs=1e-12)
 
 
+STIFF_FREQUENCY = 1.2
+TOUCHES_STIFF = np.hypot(1 - STIFF_FREQUENCY**2, 0.2 * STIFF_FREQUENCY)
+
+
+def stiff(force):
+    belt = jb.Belt(0.5, jb.Coulomb(1.0, 0.8), load=0.3, lower=1.0)
+    return jb.Oscillator(0.2, (belt,), forcing=jb.Harmonic(force, STIFF_FREQUENCY))
+
+
+@pytest.mark.parametrize(
+    "at",
+    [
+        0.50125,
+        pytest.param(0.496, marks=pytest.mark.slow),
+        pytest.param(0.5012, marks=pytest.mark.slow),
+        pytest.param(TOUCHES_STIFF, marks=pytest.mark.slow),
+    ],
+)
+def test_a_motion_of_more_periods_that_shrinks_onto_one_of_fewer_is_that_one(at):
+    """Above the point motions of three and four periods attract, which are one of one period there:
+    that of the linear oscillator without the belt."""
+    point = jb.refine(jb.GrazingEdge(0), stiff, at=at)
+    assert float(point.value) == pytest.approx(TOUCHES_STIFF, abs=1e-13)
+    assert point.cycle.periods == 1
+    linear = np.exp(-0.1 * 2 * np.pi / STIFF_FREQUENCY)
+    np.testing.assert_allclose(np.abs(point.cycle.multipliers), linear, rtol=1e-11)
+
+
+@pytest.mark.slow
+def test_a_motion_of_three_periods_that_touches_once_in_them_keeps_them():
+    point = jb.refine(jb.GrazingEdge(0), stiff, at=1.02 * TOUCHES_STIFF)
+    assert int(point.status) == jb.Status.OK
+    assert float(point.value) > 1.02 * TOUCHES_STIFF
+    assert point.cycle.periods == 3
+
+
 def test_only_conditions_that_forced_oscillators_have_are_taken():
     with pytest.raises(ValueError, match="condition must be stable, as osc is forced"):
         jb.refine(jb.GrazingEdge(0, unstable=True), osc, at=0.5)

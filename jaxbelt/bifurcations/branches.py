@@ -19,6 +19,7 @@ from ..activity import note_progress
 from ..cycles.periodic import (
     PeriodicMotion,
     is_same_motion,
+    motion_between_halves,
     periodic_from,
     state_near_start,
 )
@@ -35,7 +36,6 @@ from .forced import (
     SwitchingSliding,
     Torus,
     friction_jumps,
-    motion_between_halves,
 )
 from .forced_ends import borders_of
 from .legs import ForcedLine, MotionBranch, MotionLeg, MotionRow

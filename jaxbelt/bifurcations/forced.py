@@ -29,16 +29,14 @@ from jaxtyping import Array
 
 from ..checks import as_finite, is_concrete, require
 from ..cycles.chains import Loop, padded_loop
-from ..cycles.clocked import (
-    guards_along,
-    timed_chain_of,
-    turns_of,
-)
+from ..cycles.clocked import guards_along, timed_chain_of, turns_of
 from ..cycles.periodic import (
     PeriodicMotion,
     begun_off_events,
     motion_at,
+    motion_between_halves,
     nothing_found,
+    of_least_periods,
     periodic_from,
     periods_of,
     state_at_phase_0,
@@ -170,7 +168,21 @@ class AbstractForcedCondition(AbstractCondition):
         osc = lax.stop_gradient(variation.oscillator(value))
         motion = begun_off_events(osc, motion)
         some = sorted(self.beginnings_of(osc, motion), key=lambda one: one.distance)
-        return [self.point_of(variation, osc, value, one) for one in some[:TRIED]]
+        found = [self.point_of(variation, osc, value, one) for one in some[:TRIED]]
+        return [point for one in found for point in self._of_least_periods(variation, one)]
+
+    def _of_least_periods(
+        self, variation: Variation, point: BifurcationPoint
+    ) -> list[BifurcationPoint]:
+        """The point; where a motion of more periods has shrunk onto one of fewer there, those of
+        the latter."""
+        if int(point.status) != Status.OK:
+            return [point]
+        osc, value, motion = lax.stop_gradient((point.oscillator, point.value, point.cycle))
+        least = of_least_periods(osc, motion, motion.chain.turns)
+        if least.periods == motion.periods:
+            return [point]
+        return self.points(variation, value[None], least) if int(least.status) == Status.OK else []
 
     def point_of(
         self, variation: Variation, osc: Oscillator, value: Any, beginning: Beginning
@@ -283,18 +295,6 @@ def motions_to_begin_from(osc: OwnOscillator, start: Any, turns: int) -> Sequenc
         found = motions_of(osc, STARTS_OF_MOTIONS, turns)
     between = [motion_between_halves(osc, motion, turns) for motion in found]
     return found + [motion for motion in between if motion is not None]
-
-
-def motion_between_halves(
-    osc: Oscillator, motion: PeriodicMotion, turns: int
-) -> PeriodicMotion | None:
-    """The motion of half as many periods from which one may have left in a period doubling."""
-    half, odd = divmod(motion.periods, 2)
-    if odd:
-        return None
-    starts = np.asarray(motion.starts)
-    between = periodic_from(osc, 0.5 * (starts[0] + starts[half]), half, turns)
-    return between if int(between.status) == Status.OK else None
 
 
 # --- multipliers ----------------------------------------------------------------------------------

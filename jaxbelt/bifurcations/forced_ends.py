@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from ..cycles.clocked import turns_of
-from ..cycles.periodic import PeriodicMotion
+from ..cycles.periodic import PeriodicMotion, motion_between_halves
 from ..model.oscillator import Oscillator
 from ..numerics.continuation import continue_curve
 from ..results import Status
@@ -26,7 +26,6 @@ from .forced import (
     PeriodDoubling,
     SwitchingSliding,
     UnitCircle,
-    motion_between_halves,
 )
 from .forced_edges import edged_belts
 from .special import FAR, SpecialPoint, Trail, is_elsewhere

@@ -491,6 +491,18 @@ def of_least_periods(osc: Oscillator, motion: PeriodicMotion, turns: int) -> Per
     return motion
 
 
+def motion_between_halves(
+    osc: Oscillator, motion: PeriodicMotion, turns: int
+) -> PeriodicMotion | None:
+    """The motion of half as many periods from which one may have left in a period doubling."""
+    half, odd = divmod(motion.periods, 2)
+    if odd:
+        return None
+    starts = np.asarray(motion.starts)
+    between = periodic_from(osc, 0.5 * (starts[0] + starts[half]), half, turns)
+    return between if int(between.status) == Status.OK else None
+
+
 @announced("periodic")
 def periodic(osc: Oscillator, guess: ArrayLike | tuple, *, periods: int = 1) -> PeriodicMotion:
     """The periodic motion of a forced oscillator near a guess, stable or not, sticking or not.
