@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
+from test_periodic import closed_form
 
 import jaxbelt as jb
+from jaxbelt.numerics.continuation import Stop
 from tests.campaign import forced, forced_cases
 
 SPAN = (1.6, 1.9), (0.02, 0.2)
@@ -81,3 +83,66 @@ def test_a_curve_of_torus_points_goes_from_one_strong_resonance_to_another():
         engine = forced.Oscillator(0.0, (belt,), (forced.Harmonic(0.05, frequency),))
         _, multipliers = forced_cases.periodic(engine, np.asarray(motion.start), 1)
         assert multipliers[0] ** order == pytest.approx(1.0, abs=1e-7)
+
+
+@pytest.mark.slow
+def test_a_curve_of_crossing_ends_where_it_turns_into_switching_whatever_the_step():
+    """Where the mass turns back friction can just hold it, and the force is largest."""
+
+    def equations(unknowns):
+        X, phase, _ = closed_form(*unknowns)
+        return [abs(np.cos(phase) - X) - unknowns[1], np.sin(phase)]
+
+    expected = fsolve(equations, [0.49, 0.29], xtol=1e-14)
+
+    def osc(frequency, friction):
+        return jb.presets.den_hartog(frequency, friction=friction)
+
+    point = jb.refine(jb.CrossingSliding(0), lambda friction: osc(0.495, friction), at=0.3)
+    for step in (0.05, 0.02):
+        curve = jb.bifurcation_curve(point, osc, ((0.3, 0.51), (0.05, 0.95)), step=step)
+        (end,) = curve.special
+        assert (end.kind, end.belts) == ("SwitchingSliding", (0,))
+        assert end.values == pytest.approx(expected, abs=1e-11)
+        assert tuple(curve.path[0]) == end.values
+        # The last row is where the step is bisected to, ten times.
+        assert curve.values[0] == pytest.approx(expected, abs=step * 2**-10)
+
+
+def between_equal_belts(phase, unit):
+    def osc(force, frequency):
+        law = jb.Coulomb(1.0, 1.0)
+        belts = [jb.Belt(way * 0.5 * unit, law, load=0.3 * unit) for way in (1, -1)]
+        return jb.Oscillator(0.1, belts, forcing=jb.Harmonic(force * unit, frequency, phase))
+
+    return osc
+
+
+BOTH_PHASES_AND_UNITS = pytest.mark.parametrize(("phase", "unit"), [(0.0, 1.0), (1.0, 1e5)])
+
+
+@pytest.mark.slow
+@BOTH_PHASES_AND_UNITS
+def test_what_holds_for_both_belts_all_along_a_curve_is_no_special_point(phase, unit):
+    osc = between_equal_belts(phase, unit)
+    point = jb.refine(jb.CrossingSliding(0), lambda force: osc(force, 0.65), at=1.0)
+    # There an event passes the phase 0 at (1.0112, 0.6339) without a phase, at others with it.
+    curve = jb.bifurcation_curve(point, osc, ((0.55, 1.05), (0.6, 1.3)), step=0.05)
+    assert len(curve) > 10
+    assert set(curve.ends) == {Stop.LEFT_SPAN}
+    assert curve.special == ()
+
+
+@pytest.mark.slow
+@BOTH_PHASES_AND_UNITS
+def test_a_border_that_symmetric_motions_meet_is_named(phase, unit):
+    osc = between_equal_belts(phase, unit)
+    point = jb.refine(jb.SwitchingSliding(0), lambda frequency: osc(1.4, frequency), at=0.37)
+    curve = jb.bifurcation_curve(point, osc, ((1.35, 1.5), (0.33, 0.4)), step=0.05)
+    (met,) = curve.special
+    assert met.kind == "AddingSliding"
+    # The other curve as far as frequencies of 0.3635, 0.364 and 0.3645 show it.
+    force, frequency = met.values
+    known = [0.3635, 0.364, 0.3645], [1.495773, 1.492969, 1.490173]
+    adding = np.polynomial.Polynomial.fit(*known, 2)
+    assert force == pytest.approx(adding(frequency), abs=3e-5)

@@ -2,7 +2,7 @@
 curve goes on where only its signature changes: `beyond_change`."""
 
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -68,6 +68,11 @@ def where_it_ends(track: Track, last: CurvePoint, beyond: CurvePoint) -> tuple[n
         exists = at.found and track.seen_at(at.u).exists
         known, ends = (part, ends) if exists else (known, part)
     return track.corrected(last.u, last.tangent, known * length).u, (ends - known) * length
+
+
+def apart(values: Sequence[float] | np.ndarray, u: np.ndarray) -> float:
+    """How far both parameters are from those of the unknowns u of a curve."""
+    return float(np.hypot(*np.subtract(values, u[-2:])))
 
 
 def just_ahead(seen: list[tuple[CurvePoint, Seen]], step: float) -> list[SpecialPoint]:

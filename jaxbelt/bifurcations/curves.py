@@ -40,6 +40,7 @@ from .changes import (
     SAME_POINT_AGAIN,
     CurveProblem,
     CurveRow,
+    apart,
     beyond_change,
     just_ahead,
     named_once,
@@ -342,6 +343,7 @@ def _side(
     rows: list[CurveRow] = []
     seen_last: list[tuple[CurvePoint, Seen]] = []
     special: list[SpecialPoint] = []
+    is_forced = isinstance(problem.condition, AbstractForcedCondition)
     while True:
         note_progress(f"{len(rows)} points on one side")
         most = min(REMESH, problem.max_points - max(len(rows) - 1, 0))
@@ -370,7 +372,6 @@ def _side(
             trail = trail._replace(end=Stop.STEP_TOO_SMALL)
             # What is watched with forcing does not change the signature; the curve of a multiplier
             # ends where the signature does.
-            is_forced = isinstance(problem.condition, AbstractForcedCondition)
             changes = [] if is_forced else just_ahead(seen_last, problem.step)
             special += changes
             goes_on = is_forced and not isinstance(problem.condition, UnitCircle) and points
@@ -392,12 +393,13 @@ def _side(
         rests = isinstance(track.system, RestSystem)
         is_end = problem.condition.ends_at_contact and (bool(changes) or rests)
         further = None if is_end else beyond_change(problem, track, rows, last, centre)
-        if further is None and rests and beyond is not None:
+        if further is None and (rests or is_forced) and beyond is not None:
+            at_end = [one for one in leg.at_change if apart(one.values, known) < 2 * error]
             step = points[-1], beyond
-            return _rest_ended(problem, track, rows, passed, trail, step, known)
+            return _ended_between(problem, track, rows, (passed, at_end), trail, step, known)
         if further is None:
             return _ended(problem, rows, special, trail)
-        special += [] if changes else border_at(problem.condition, trail, centre, error)
+        special += [] if changes else border_at(problem.condition, trail, further[0], centre, error)
         track, u = Track.begun(problem.variation, *further)
         direction = track.tangent(u)
         direction = direction * np.sign(direction[-2:] @ (u[-2:] - centre))
@@ -444,39 +446,35 @@ def _ended(
     return _OneSide(rows, [*special, *filter(None, named)], trail.end)
 
 
-def _rest_ended(
+def _ended_between(
     problem: CurveProblem,
     track: Track,
     rows: list[CurveRow],
-    special: list[SpecialPoint],
+    special: tuple[list[SpecialPoint], list[SpecialPoint]],
     trail: Trail,
     step: tuple[tuple[CurvePoint, Seen], CurvePoint],
     u: np.ndarray,
 ) -> _OneSide:
-    """The side of a curve of states of rest that ends at u, with a row there.
+    """The side of a curve of states of rest, or of forced motions, that ends at u: a row is there.
 
-    special: up to its last point; step: from that point to one where there is no such state.
+    special: up to its last point, and at u; step: from that point to one where there is no such.
     """
-    last, beyond = step
+    (passed, known), (last, beyond) = special, step
     end = beyond._replace(u=u), track.seen_at(u)
-    if beyond.end is Stop.LEFT_SPAN and _at_one_point(u, beyond.u):
+    if beyond.end is Stop.LEFT_SPAN and apart(u[-2:], beyond.u) < SAME_POINT_AGAIN:
         trail = trail._replace(end=Stop.LEFT_SPAN)
-    # What is watched vanishes at the end without a change of sign.
+    # What is watched may vanish at the end without a change of sign.
     tests, behind, pair = end[1].tests, track.seen_at(beyond.u).tests, (float(u[-2]), float(u[-1]))
     at_end = {
         name: SpecialPoint(*name, pair, abs(value))
         for name, value in tests.items()
         if abs(value) < HOLDS and not abs(behind[name]) < HOLDS
-    }
+    } | {(one.kind, one.belts): one for one in known}
     between = special_between(track, problem.limits, last, end)
-    special = [*special, *(one for one in between if (one.kind, one.belts) not in at_end)]
-    side = _ended(problem, rows, [*special, *at_end.values()], trail)
-    new = [] if _at_one_point(u, last[0].u) else [_row_at(problem, track, u, end[1])]
-    return side._replace(rows=[*rows, *new])
-
-
-def _at_one_point(u: np.ndarray, other: np.ndarray) -> bool:
-    return bool(np.linalg.norm((u - other)[-2:]) < SAME_POINT_AGAIN)
+    passed = [*passed, *(one for one in between if (one.kind, one.belts) not in at_end)]
+    side = _ended(problem, rows, [*passed, *at_end.values()], trail)
+    is_row = apart(u[-2:], last[0].u) < SAME_POINT_AGAIN
+    return side._replace(rows=[*rows, *([] if is_row else [_row_at(problem, track, u, end[1])])])
 
 
 def _end_at_rest(problem: CurveProblem, rows: list[CurveRow], near: float) -> SpecialPoint | None:

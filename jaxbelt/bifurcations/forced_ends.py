@@ -14,8 +14,10 @@ import numpy as np
 
 from ..cycles.clocked import turns_of
 from ..cycles.periodic import PeriodicMotion, motion_between_halves
+from ..model.events import of_one_loop
 from ..model.oscillator import Oscillator
 from ..numerics.continuation import continue_curve
+from ..numerics.newton import HOLDS
 from ..results import Status
 from .base import AbstractCondition, BifurcationPoint
 from .crossings import CrossingSliding
@@ -68,26 +70,34 @@ def meeting_point(condition: AbstractCondition, trail: Trail) -> SpecialPoint | 
 
 
 def border_at(
-    condition: AbstractCondition, trail: Trail, centre: np.ndarray, error: float
+    condition: AbstractCondition,
+    trail: Trail,
+    beyond: BifurcationPoint,
+    centre: np.ndarray,
+    error: float,
 ) -> list[SpecialPoint]:
     """The border that a forced motion meets on a curve where its signature changes.
 
-    trail: up to a point beside; centre, error: where it changes, and how well that is known.
+    trail: up to a point beside; beyond: the point with which the curve goes on; centre, error:
+    where it changes, and how well that is known.
     """
     if not isinstance(condition, AbstractForcedCondition):
         return []
     osc = trail.variation.oscillator(trail.values[-1])
     motion = trail.system.motion(osc, trail.x)
-    others = [
-        border for border in borders_of(osc) if border.with_clock().lineage != condition.lineage
-    ]
-    distances = [
-        min((float(one.distance) for one in some), default=np.inf)
-        for some in (border.with_clock().beginnings_of(osc, motion) for border in others)
-    ]
-    if not distances or min(distances) > trail.step:
+    if of_one_loop(motion.signature) == of_one_loop(beyond.cycle.signature):
+        return []  # an event passes the phase 0
+    distances = {}
+    for border in borders_of(osc):
+        timed = border.with_clock()
+        if timed.lineage != condition.lineage:
+            some = timed.beginnings_of(osc, motion)
+            distances[border] = min((float(one.distance) for one in some), default=np.inf)
+    # What holds here, some part of a step before, holds all along the curve.
+    near = [border for border, away in distances.items() if HOLDS < away <= trail.step]
+    if not near:
         return []
-    border = others[int(np.argmin(distances))]
+    border = min(near, key=lambda one: distances[one])
     values = float(centre[0]), float(centre[1])
     return [SpecialPoint(type(border).__name__, border.belts_concerned, values, error)]
 

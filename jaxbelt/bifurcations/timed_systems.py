@@ -74,11 +74,16 @@ class TimedSystem(AbstractChainSystem):
         error = jnp.max(jnp.abs(self.residual(osc, x)))
         motion = motion_at(osc, self.chain, x, error, jnp.asarray(0), jnp.asarray(0))
         exists = (motion.status == Status.OK) & (self.judge(osc, motion) == Status.OK)
-        return Seen(self.tests(motion), exists, jnp.real(motion.multipliers[0]), error)
+        tests = self.tests(motion) | self.tests_anywhere(osc, x)
+        return Seen(tests, exists, jnp.real(motion.multipliers[0]), error)
 
     def tests(self, motion: PeriodicMotion) -> Tests:
         """Functions to watch along a curve, see `Seen`."""
         return {(kind, ()): value for kind, value in unit_circle_tests(motion).items()}
+
+    def tests_anywhere(self, osc: Oscillator, x: Array) -> Tests:
+        """Those that have values at solutions at which the motion does not exist, too."""
+        return {}
 
     def motion(self, osc: Oscillator, x: Any) -> PeriodicMotion:
         """The motion with the unknowns x of a solution, without its multipliers."""
@@ -239,10 +244,23 @@ class AtLimit(TimedSystem):
         now = at_time(osc, y[2])
         return jnp.abs(mode_acceleration(now, mode, y[0], y[1])) - capacity(now, mode)
 
+    def tests_anywhere(self, osc, x):
+        # Where the force neither rises nor falls crossing turns into switching.
+        rate, arrives_at = self._rate(osc, x), self.chain.ends[self.row]
+        turns_into = {"SwitchingSliding": self.rises > 0, "CrossingSliding": self.rises < 0}
+        return {
+            (kind, (belt,)): jnp.where(does & (arrives_at == belt), rate, jnp.nan)
+            for kind, does in turns_into.items()
+            for belt in range(self.codes.size)
+        }
+
+    def _rate(self, osc: Oscillator, z: Array) -> Array:
+        """How fast the force rises."""
+        at = guards_trend(osc, mode_of(self.codes), z[self.row + 1])
+        return -jnp.where(at.value[-2] < at.value[-1], at.slope[-2], at.slope[-1])
+
     def judge(self, osc, motion):
-        mode, y = mode_of(self.codes), motion.unknowns[self.row + 1]
-        at = guards_trend(osc, mode, y)
-        rises = -jnp.where(at.value[-2] < at.value[-1], at.slope[-2], at.slope[-1])
+        y, rises = motion.unknowns[self.row + 1], self._rate(osc, motion.unknowns)
         # A motion that only touches the boundary it arrives at grazes.
         codes, end = motion.chain.codes[self.row], motion.chain.ends[self.row]
         arrives = (self.rises == 0) | (guard_slope(osc, codes, end, y) < -ARRIVES)
