@@ -70,7 +70,7 @@ def where_it_ends(track: Track, last: CurvePoint, beyond: CurvePoint) -> tuple[n
     return track.corrected(last.u, last.tangent, known * length).u, (ends - known) * length
 
 
-def apart(values: Sequence[float] | np.ndarray, u: np.ndarray) -> float:
+def parameters_apart(values: Sequence[float] | np.ndarray, u: np.ndarray) -> float:
     """How far both parameters are from those of the unknowns u of a curve."""
     return float(np.hypot(*np.subtract(values, u[-2:])))
 

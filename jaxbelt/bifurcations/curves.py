@@ -40,10 +40,10 @@ from .changes import (
     SAME_POINT_AGAIN,
     CurveProblem,
     CurveRow,
-    apart,
     beyond_change,
     just_ahead,
     named_once,
+    parameters_apart,
     where_it_ends,
 )
 from .forced import AbstractForcedCondition, UnitCircle
@@ -394,7 +394,9 @@ def _side(
         is_end = problem.condition.ends_at_contact and (bool(changes) or rests)
         further = None if is_end else beyond_change(problem, track, rows, last, centre)
         if further is None and (rests or is_forced) and beyond is not None:
-            at_end = [one for one in leg.at_change if apart(one.values, known) < 2 * error]
+            at_end = [
+                one for one in leg.at_change if parameters_apart(one.values, known) < 2 * error
+            ]
             step = points[-1], beyond
             return _ended_between(problem, track, rows, (passed, at_end), trail, step, known)
         if further is None:
@@ -461,7 +463,7 @@ def _ended_between(
     """
     (passed, known), (last, beyond) = special, step
     end = beyond._replace(u=u), track.seen_at(u)
-    if beyond.end is Stop.LEFT_SPAN and apart(u[-2:], beyond.u) < SAME_POINT_AGAIN:
+    if beyond.end is Stop.LEFT_SPAN and parameters_apart(u[-2:], beyond.u) < SAME_POINT_AGAIN:
         trail = trail._replace(end=Stop.LEFT_SPAN)
     # What is watched may vanish at the end without a change of sign.
     tests, behind, pair = end[1].tests, track.seen_at(beyond.u).tests, (float(u[-2]), float(u[-1]))
@@ -473,7 +475,7 @@ def _ended_between(
     between = special_between(track, problem.limits, last, end)
     passed = [*passed, *(one for one in between if (one.kind, one.belts) not in at_end)]
     side = _ended(problem, rows, [*passed, *at_end.values()], trail)
-    is_row = apart(u[-2:], last[0].u) < SAME_POINT_AGAIN
+    is_row = parameters_apart(u[-2:], last[0].u) < SAME_POINT_AGAIN
     return side._replace(rows=[*rows, *([] if is_row else [_row_at(problem, track, u, end[1])])])
 
 
