@@ -20,8 +20,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, ArrayLike
 
+from ..numerics.compiling import where_any
 from .forcing import ConstantForce, Oscillating
 from .modes import (
     ABOVE,
@@ -173,18 +175,23 @@ def _holds(osc: Oscillator, mode: Mode, y: TimedState) -> Array:
 
     At the limit itself the way that it goes from there decides.
     """
-    now = at_time(osc, y[2])
+    osc, mode, y = lax.stop_gradient((osc, mode, y))
 
     def limits(y):
         return jnp.stack(_limits(at_time(osc, y[2]), mode, *y[:2]))
 
-    value, slope, curvature = trend_of(osc, mode, limits, y)
-    later = limits(carried(osc, mode, y, jnp.asarray(LATER)))
-    limit = capacity(now, mode)
-    rounding = GUARD_ROUNDING * blur(y[2]) * (1 + jnp.abs(y[0]) + limit)
-    bends = jnp.where(jnp.abs(curvature) > LEAST_CURVATURE, curvature > 0, later >= value - 1e-13)
-    goes_in = jnp.where(jnp.abs(slope) > LEAST_SLOPE, slope > 0, bends)
-    held = jnp.where(jnp.abs(value) <= rounding, goes_in, value > 0)
+    value, limit = limits(y), capacity(at_time(osc, y[2]), mode)
+    at_limit = jnp.abs(value) <= GUARD_ROUNDING * blur(y[2]) * (1 + jnp.abs(y[0]) + limit)
+
+    def goes_in():
+        _, slope, curvature = trend_of(osc, mode, limits, y)
+        later = limits(carried(osc, mode, y, jnp.asarray(LATER)))
+        bends = jnp.where(
+            jnp.abs(curvature) > LEAST_CURVATURE, curvature > 0, later >= value - 1e-13
+        )
+        return jnp.where(jnp.abs(slope) > LEAST_SLOPE, slope > 0, bends)
+
+    held = jnp.where(at_limit, where_any(at_limit, goes_in, at_limit), value > 0)
     return jnp.all(held) & (limit > 0)
 
 
@@ -393,9 +400,13 @@ def is_held_for_ever(osc: Oscillator, mode: Mode, y: TimedState) -> Array:
         still = still & (~touches | jnp.where(stuck, rests, jnp.asarray(constant)))
         least = load.mean - jnp.abs(load.amplitude) if isinstance(load, Oscillating) else load
         limit = limit + jnp.where(stuck, least * belt.friction.static, 0.0)
-    rest, bound = _pushes(osc, mode, y)
-    largest = jnp.abs(rest) + bound
-    return still & (largest <= limit * (1 + GUARD_ROUNDING)) & (limit > 0)
+
+    def holds():
+        rest, bound = _pushes(osc, mode, y)
+        return jnp.abs(rest) + bound <= limit * (1 + GUARD_ROUNDING)
+
+    still = still & (limit > 0)
+    return still & where_any(still, holds, still)
 
 
 def _pushes_for_ever(osc: Oscillator, mode: Mode, y: TimedState, sign: ArrayLike) -> Array:
