@@ -74,8 +74,9 @@ def test_a_point_on_a_side_of_the_span_is_told_once(side):
     points = list(continue_curve(line, np.zeros(2), ahead, span=span, **steps))
     assert [float(point.u[1]) for point in points] == pytest.approx([0.0, 0.25, 0.5], abs=1e-13)
     assert [point.end for point in points] == [None, None, Stop.LEFT_SPAN]
-    (only,) = continue_curve(line, side * ahead, ahead, span=span, **steps)
-    assert only.end is Stop.LEFT_SPAN
+    for start in (side, np.nextafter(side, 1.0)):
+        (only,) = continue_curve(line, start * ahead, ahead, span=span, **steps)
+        assert only.end is Stop.LEFT_SPAN and only.u[1] == pytest.approx(side, abs=1e-15)
 
 
 def test_a_pitchfork_off_its_axis_is_followed_round_the_bend():

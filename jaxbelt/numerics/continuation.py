@@ -136,10 +136,11 @@ def _next_point(solve, point: CurvePoint, step: float, steps) -> tuple[CurvePoin
 def _at_limit(solve, point: CurvePoint, beyond: CurvePoint, limits) -> CurvePoint:
     """The point where the curve meets the first side of the span, between two others."""
     # Newton's method in the length of the step, with the plane's normal along the coordinate.
-    change = beyond.u - point.u
+    change, short, far = beyond.u - point.u, beyond.u < limits[0], beyond.u > limits[1]
     with np.errstate(divide="ignore", invalid="ignore"):
-        parts = np.where(change < 0, (limits[0] - point.u) / change, (limits[1] - point.u) / change)
-    parts = np.where((change != 0) & (parts >= 0), parts, np.inf)
+        parts = (np.where(short, limits[0], limits[1]) - point.u) / change
+    # A point on the side may be beyond it by rounding.
+    parts = np.where(short | far, np.maximum(parts, 0.0), np.inf)
     axis = int(np.argmin(parts))
     guess = point.u + parts[axis] * change
     normal = np.zeros_like(guess)
