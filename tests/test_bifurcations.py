@@ -59,6 +59,7 @@ def test_cycle_at_a_fold_has_a_stick_phase_of_no_duration():
     assert point.multiplier > 1
 
 
+@pytest.mark.slow(first=True)
 def test_cycle_at_a_grazing_point_goes_on():
     point = jb.refine(jb.GrazingSliding(0), class_b(-0.44), where=nu0)
     assert point.cycle.stick_durations[0] == pytest.approx(0, abs=1e-10)

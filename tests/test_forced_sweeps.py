@@ -243,6 +243,7 @@ def test_a_base_motion_is_swept_as_the_force_that_it_equals(names):
     assert one.x1_max.values.ravel()[-1] == pytest.approx(float(motion.x1_max), abs=1e-5)
 
 
+@pytest.mark.slow(first=True)
 def test_starts_are_swept_with_forcing_and_a_contact_edge():
     law = jb.Coulomb(0.5, 0.3)
     belts = jb.Belt(0.15, law), jb.Belt(-0.1, law, lower=0.1)

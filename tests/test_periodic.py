@@ -178,6 +178,7 @@ def test_motions_and_multipliers_are_those_of_the_engine(smooth, sticking):
     assert float(sticking.stick_durations[0]) == pytest.approx(stuck[0], abs=1e-10)
 
 
+@pytest.mark.slow(first=True)
 def test_unstable_motions_are_found_from_a_guess(smooth):
     between = 0.5 * (smooth.starts[0] + smooth.starts[2])
     motion = jb.periodic(bkn(1.7079), between, periods=2)

@@ -31,6 +31,7 @@ def point():
     return jb.refine(jb.SymmetryBreaking(), osc, at=0.476, start=(0.5, 0.2))
 
 
+@pytest.mark.slow(first=True)
 def test_a_multiplier_of_the_engine_is_one_where_symmetry_breaks(point):
     """On the symmetric motion, to both sides: its multiplier is a smooth function there."""
     value, away = float(point.value), 2e-3 * np.array([-2.0, -1.0, 1.0, 2.0])

@@ -467,11 +467,11 @@ def _ended_between(
         trail = trail._replace(end=Stop.LEFT_SPAN)
     # What is watched may vanish at the end without a change of sign.
     tests, behind, pair = end[1].tests, track.seen_at(beyond.u).tests, (float(u[-2]), float(u[-1]))
-    at_end = {
+    at_end = {(one.kind, one.belts): one for one in known} | {
         name: SpecialPoint(*name, pair, abs(value))
         for name, value in tests.items()
         if abs(value) < HOLDS and not abs(behind[name]) < HOLDS
-    } | {(one.kind, one.belts): one for one in known}
+    }
     between = special_between(track, problem.limits, last, end)
     passed = [*passed, *(one for one in between if (one.kind, one.belts) not in at_end)]
     side = _ended(problem, rows, [*passed, *at_end.values()], trail)
