@@ -274,13 +274,12 @@ def outside_of_traces(function: Callable, instead: str = "") -> Any:
     def call(*args: Any, **kwargs: Any) -> Any:
         require_own_threads()
         refuse_other_names(name, signature.parameters, kwargs)
-        scope = f"{name} is not for jit, vmap or derivatives"
+        traced = None
         if not _is_known((args, kwargs)):
             given = signature.bind_partial(*args, **kwargs).arguments
-            field = next(field for field, one in given.items() if not _is_known(one))
-            require(False, field, f"known: {scope}", f"a traced one{instead}")
-        if not is_outermost():
-            raise ValueError(f"{name} must be called outside of jax.jit: {scope}{instead}")
+            traced = next(field for field, one in given.items() if not _is_known(one))
+        scope = f"{name} is not for jit, vmap or derivatives"
+        _refuse_traces(name, scope, traced, instead)
         return function(*args, **kwargs)
 
     return call
@@ -291,11 +290,19 @@ def require_outside_of_jit(name: str, hint: str, **given: Any) -> None:
 
     hint: what to do there. given: its arguments, of which the first that is traced is named.
     """
-    for field, value in given.items():
-        known = is_concrete(value) or is_concrete(jax.lax.stop_gradient(value))
-        require(known, field, f"known: {hint}", "a traced one")
+
+    def is_known(value: Any) -> bool:
+        return is_concrete(value) or is_concrete(jax.lax.stop_gradient(value))
+
+    _refuse_traces(name, hint, next((f for f, one in given.items() if not is_known(one)), None))
+
+
+def _refuse_traces(name: str, scope: str, traced: str | None, instead: str = "") -> None:
+    """Raises if an argument, of that name, is traced, or the call is within a trace."""
+    if traced is not None:
+        require(False, traced, f"known: {scope}", f"a traced one{instead}")
     if not is_outermost():
-        raise ValueError(f"{name} must be called outside of jax.jit: {hint}")
+        raise ValueError(f"{name} must be called outside of jax.jit: {scope}{instead}")
 
 
 def _is_known(value: Any) -> bool:
