@@ -61,6 +61,7 @@ def test_two_cycles_with_one_sequence_of_events_are_two():
     assert found.fraction.values.tolist() == [40 / 45, 5 / 45]
 
 
+@pytest.mark.slow(first=True)
 def test_runs_that_leave_it_open_are_told_apart_by_shooting(dataset):
     """As far apart as runs of one cycle that attracts weakly, or of two cycles."""
     moved = dataset.copy(deep=True)

@@ -61,6 +61,7 @@ def test_published_basin_stability_and_area_of_the_unstable_cycle(velocity):
     assert abs(fraction - theirs) < 4 * np.hypot(error, np.sqrt(theirs * (1 - theirs) / 5000))
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(("velocity", "exact"), [(1.0, 0.0), (1.9, 1.0)])
 def test_one_attractor_alone_is_exact(velocity, exact):
     found = jb.basin_stability(belt_drive(velocity), box=BOX, n=2_000, key=jax.random.key(2))

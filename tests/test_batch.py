@@ -162,6 +162,7 @@ def test_degenerate_velocities():
     assert kinds.values.tolist() == ["cycle", "stuck", "stuck", "stuck", "cycle"]
 
 
+@pytest.mark.slow(first=True)
 def test_an_excursion_within_one_step_is_found():
     """An undamped circle just beyond a boundary, or an edge, twice; steps of half a unit and more.
 

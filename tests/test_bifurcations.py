@@ -169,13 +169,14 @@ def test_a_law_with_a_jump():
     assert oracle_cycles.sticking_cycle(make(expected + 1e-6)) is None
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(
     ("condition", "nu", "status"),
     [
-        pytest.param(jb.GrazingSliding(0), 0.52, Status.NOT_TOUCHED, marks=FIRST),
+        (jb.GrazingSliding(0), 0.52, Status.NOT_TOUCHED),
         (jb.GrazingSliding(1), 0.52, Status.OTHER_KIND),
-        pytest.param(jb.NonsmoothFold(0), -0.45, Status.OTHER_KIND, marks=FIRST),
-        pytest.param(jb.SlidingExchange((0, 1)), 0.6, Status.NOT_TOUCHED, marks=FIRST),
+        (jb.NonsmoothFold(0), -0.45, Status.OTHER_KIND),
+        (jb.SlidingExchange((0, 1)), 0.6, Status.NOT_TOUCHED),
         (jb.SuddenSliding(1), 0.3, Status.NO_CONVERGENCE),
     ],
 )

@@ -43,6 +43,7 @@ def onset(phase, amplitude=AMPLITUDE):
 # --- fixed points ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(first=True)
 def test_fixed_points_are_sticking_periodic_motions(found):
     """The phase of onset is that of the arcs of what `find_cycle` and `periodic` find."""
     motion = jb.find_cycle(bkn(), (0.5, 0.0))

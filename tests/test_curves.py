@@ -509,6 +509,7 @@ def grazing():
     return jb.refine(jb.GrazingSliding(0), lambda v: jb.presets.class_b(v, 0.35), at=-0.45)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("step", [0.02, 0.03, 0.04, 0.06])
 def test_a_curve_goes_on_behind_a_second_contact_whatever_the_step_is(grazing, step):
     """With every other step it ended there, as too few distances behind were tried."""

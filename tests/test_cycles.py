@@ -208,6 +208,7 @@ def test_a_start_that_sticks_to_a_belt_at_rest_stays_there(sign):
     assert jb.find_cycle(osc, (sign * 0.57, sign * 1.2)).status == Status.STUCK_FOREVER
 
 
+@pytest.mark.slow(first=True)
 def test_where_there_is_no_cycle_every_number_is_nan():
     held = jb.find_cycle(jb.presets.class_a(0.0), (3.0, 0.0))
     assert held.status == Status.STUCK_FOREVER
@@ -447,6 +448,7 @@ def test_derivatives_of_functionals():
     assert reverse == pytest.approx(slopes, rel=1e-8)
 
 
+@pytest.mark.slow(first=True)
 def test_square_root_law_near_the_hopf_point():
     """The amplitude r of the unstable cycle: r^2 -> -(trace/2)/a with the Lyapunov coefficient a.
 

@@ -437,6 +437,7 @@ def test_nothing_raises_under_jit():
     assert not np.any(bad.kind) and np.all(np.isnan(bad.x1)) and not np.any(bad.stable)
 
 
+@pytest.mark.slow(first=True)
 def test_derivatives_of_a_fixed_point_are_those_of_the_formulas():
     _, nu, mus, p1, p2, p3 = p = (0.4, 0.3, 1.1, 0.5, 0.2, 8.0)
 

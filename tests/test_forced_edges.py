@@ -26,6 +26,7 @@ def touching_force(frequency, way=1.0, edge=EDGE):
     return (edge - way * FRICTION) * response
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(("frequency", "way"), [(0.7, 1.0), (0.9, -1.0)])
 def test_a_motion_touches_the_edge_where_the_closed_form_says(frequency, way):
     expected = touching_force(frequency, way)
@@ -84,6 +85,7 @@ def stiff(force):
     return jb.Oscillator(0.2, (belt,), forcing=jb.Harmonic(force, STIFF_FREQUENCY))
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(
     "at",
     [

@@ -48,6 +48,7 @@ def test_shift_by_a_period_changes_nothing(swept):
     assert np.allclose(later.x1_end.values[:, 0], here.x1_end.values, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow(first=True)
 def test_an_axis_may_begin_with_the_frequency_0():
     """Where it is known to be 0 the force is a constant one, without a clock."""
     frequency = np.array([0.0, 1.7])
@@ -171,6 +172,7 @@ def test_an_orbit_diagram_has_the_periods_of_find_cycle():
     assert {"cycle", "no period found"} == set(diagram.kind.ravel().tolist())
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("x2", [-9.184850993605148e-17, 0.0, -1e-12])
 def test_a_mass_on_an_edge_that_a_belt_just_begins_to_carry(x2):
     """The belt is at rest at t = 0 up to rounding, as cos(3 pi / 2) is, and the other belt touches
@@ -190,6 +192,7 @@ def test_a_mass_on_an_edge_that_a_belt_just_begins_to_carry(x2):
     np.testing.assert_allclose(found.x2_end[0], 0.5 * np.sin(0.5), atol=1e-10)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(
     ("load", "velocity", "edge", "force", "start"),
     [

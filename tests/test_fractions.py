@@ -198,6 +198,7 @@ def test_two_attractors_that_change_places_in_size_keep_their_names():
     ]
 
 
+@pytest.mark.slow(first=True)
 def test_a_shift_of_all_is_followed_though_one_is_nearer_to_another():
     first = [met(CYCLE, 0.0), met(CYCLE, 1.0)]
     second = [met(CYCLE, 0.9), met(CYCLE, 1.9)]

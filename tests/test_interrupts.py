@@ -180,6 +180,7 @@ def test_interrupts_of_a_session_lose_nothing(tmp_path, monkeypatch):
     assert told["interrupted"] == 3 and told["longest"] < SOON
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("where", [(threads, "wait"), (Question, "of"), (Memory, "dataset")])
 def test_an_interrupt_in_a_callback_of_the_garbage_collector_is_not_lost(monkeypatch, where):
     """Python would print that it is ignored, and the sweep would go on to its end."""

@@ -448,6 +448,7 @@ def test_bounds_are_where_an_oscillator_becomes_impossible():
     assert interval(static, kinetic) == (0.0, np.inf)
 
 
+@pytest.mark.slow(first=True)
 def test_a_contact_edge_below_zero_is_designed():
     law = jb.Conti(1.0, 0.6, 10.0)
 

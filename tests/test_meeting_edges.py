@@ -272,6 +272,7 @@ def touching(upper, other=0.75, velocity=0.35, load=1.0):
     return jb.Oscillator(0.5, belts)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("step", [0.5, 0.1, 0.03])
 def test_a_curve_ends_where_the_mass_ceases_to_rest_at_the_edges(step):
     """Between where nothing pushes from the right, at 0, and where both belts pull no farther."""
@@ -323,6 +324,7 @@ def test_a_curve_ends_where_a_belt_pulls_no_more(name, span, kinds, end):
         assert curve.values[0] == pytest.approx((0.75, end), abs=1e-12)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(("side", "first", "last"), [("upper", -1.0, 1.0), ("lower", -0.3, 1.7)])
 def test_a_curve_ends_where_a_belt_at_rest_holds_no_more(side, first, last):
     """Belt 0 at rest holds 1, between the edges alone or with belt 1, which pulls with 0.7."""

@@ -293,6 +293,7 @@ def test_units_of_ten_change_rounding_only(k):
     np.testing.assert_allclose(other.value / length, point.value, rtol=1e-12)
 
 
+@pytest.mark.slow(first=True)
 def test_a_newton_and_a_stiff_spring_in_metres():
     """N = 1 N, k = 1e5 N/m: a portrait without a cycle was found here, with the status OK."""
     osc = oscillator(length=1e-5, omega=1e5**0.5)

@@ -560,6 +560,7 @@ def test_the_amplitude_and_its_derivatives_are_those_of_the_closed_form():
         assert float(slope) == pytest.approx((4 * near - far) / 3, abs=1e-9)
 
 
+@pytest.mark.slow(first=True)
 def test_a_guess_beside_a_stick_gives_no_stick_phase_of_no_duration():
     stopping = jb.find_cycle(den_hartog(0.47), (0.0, 0.0))
     assert len(stopping.signature) == 4 and stopping.start[1] == 0.0
@@ -708,6 +709,7 @@ def test_no_motion_begins_a_stick_phase_off_its_belt():
 # --- where t is 0 makes no difference -------------------------------------------------------------
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("phase", [0.0, 0.5])
 def test_a_motion_with_an_event_at_the_phase_0_has_it_once(phase):
     """At the first phase the mass begins to stick 2e-5 before t = 0."""
@@ -721,6 +723,7 @@ def test_a_motion_with_an_event_at_the_phase_0_has_it_once(phase):
     np.testing.assert_allclose(motion.sample(5)[0], motion.start, atol=1e-12)
 
 
+@pytest.mark.slow(first=True)
 def test_the_derivative_of_a_start_of_a_chain_that_begins_elsewhere():
     """By differences of the engine, in which the mass sticks at the phase 0, too: its x1 there
     after a period is a function of its x1 before."""
@@ -749,6 +752,7 @@ def test_the_derivative_of_a_start_of_a_chain_that_begins_elsewhere():
     assert float(motion.multipliers[0].real) == pytest.approx(by_x1, rel=1e-6)
 
 
+@pytest.mark.slow(first=True)
 def test_motions_beside_where_an_event_passes_the_phase_0():
     frequencies = jnp.linspace(1.2, 1.26, 7)
 
@@ -767,6 +771,7 @@ def test_motions_beside_where_an_event_passes_the_phase_0():
     np.testing.assert_allclose(run.ys[-1], starts[-1], atol=1e-8)
 
 
+@pytest.mark.slow(first=True)
 def test_the_error_of_an_exponent_is_no_less_than_rounding():
     """Without damping and load both exponents are zero."""
     belt = jb.Belt(0.3, jb.Coulomb(1.0, 1.0), 0.0)

@@ -590,6 +590,7 @@ def starts_at_rest_on_an_edge(seed: int) -> np.ndarray:
     return np.array(grid)
 
 
+@pytest.mark.slow(first=True)
 @seeds
 @two_belts_by_day
 def test_an_image_ends_there_too(image_of, seed):

@@ -324,6 +324,7 @@ def test_a_belt_whose_load_is_zero_in_the_middle_of_the_path_has_its_edges():
 # --- belts of one velocity, and corners -----------------------------------------------------------
 
 
+@pytest.mark.slow(first=True)
 def test_belts_that_change_places_where_a_cycle_sticks_to_both():
     """The slip arc between the two stick phases takes no time at the point; the cycle there is
     that of one belt with the load of both."""
@@ -428,6 +429,7 @@ def rate_of_focus(nu1, damping=0.62):
     return oracle_cycles.pseudo_focus_rate(its_oracle(nu1, damping), SHARED)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("nu1", [-1e-3, 1e-3, 1e-4])
 def test_a_cycle_as_small_as_a_belt_is_slow(nu1):
     """The focus repels, and where the mass overtakes the belt this brakes it."""

@@ -473,6 +473,7 @@ def test_start_on_a_boundary_with_a_rounded_velocity():
     assert run.modes[0, 0] == 0
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("x2", [-0.4, 0.0, 0.4])
 @pytest.mark.parametrize("sigma", [-0.5, 0.3, 1.1])
 def test_starts_on_a_contact_edge(sigma, x2):
@@ -508,6 +509,7 @@ def two_belts(nu0, nu1, lower, upper, other=OTHER):
     return here, there
 
 
+@pytest.mark.slow(first=True)
 def test_an_edge_met_while_sticking_still_stuck():
     run = agree(*two_belts(0.3, 2.0, 0.2, np.inf), (-0.5, 0.3), span=15.0)
     edge = int(np.argmax(np.asarray(run.events.kind) == EventKind.EDGE))

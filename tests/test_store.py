@@ -195,6 +195,7 @@ def test_runs_that_are_not_done_are_told_apart(tmp_path):
         jb.attractors(starts)
 
 
+@pytest.mark.slow(first=True)
 def test_an_audit_of_a_store(path):
     found = again(path, audit=1.0)
     assert (found.attrs["audited"], found.attrs["audit_differed"]) == (15, 0)
@@ -381,6 +382,7 @@ def test_what_a_function_reads_belongs_to_the_question(reader, tmp_path, monkeyp
     assert sweep("a").equals(first) and sweep().equals(first)
 
 
+@pytest.mark.slow(first=True)
 def test_which_parameters_vary_belongs_to_the_question(tmp_path):
     law = jb.Conti(1.0, 0.6, 10.0)
     axes, store = {"p": np.linspace(0.3, 0.6, 4)}, tmp_path / "of_damping.zarr"

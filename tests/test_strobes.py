@@ -461,6 +461,7 @@ def test_a_mass_that_swings_with_a_belt_wherever_it_stuck_to_it_has_no_attractor
     assert np.all(found.status == Status.NEUTRAL) and np.all(found.n_events == 1)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("t", [10.0, 400.0, 3e4])
 def test_a_mass_that_a_belt_carries_has_no_extrema(t):
     """Rounding of the time makes its velocity vary; steps were cut to a thousandth there."""
@@ -552,6 +553,7 @@ def test_the_winding_number_of_a_periodic_motion_counts_its_maxima():
     np.testing.assert_array_equal(row.winding, 1.0)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("frequency", [0.25, 1.0])
 @pytest.mark.parametrize("start", [2.0, 1.0])
 def test_a_motion_that_has_lost_its_tangent_once_attracts_nothing(frequency, start):
@@ -566,6 +568,7 @@ def test_a_motion_that_has_lost_its_tangent_once_attracts_nothing(frequency, sta
     assert found.kind[0] == "undecided" and found.status[0] == "neutral"
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("steepness", [2.0, 10.0, 100.0])
 def test_a_cycle_that_slips_past_the_strobe_repeats_nothing(steepness):
     """A force of amplitude 0 whose period is nearly that of a cycle: the phase drifts, or stays

@@ -6,6 +6,7 @@ import pytest
 import jaxbelt as jb
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(
     ("start", "step"),
     [

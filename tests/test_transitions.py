@@ -42,12 +42,13 @@ def slopes_on_both_sides(function, edges, h):
     )
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(
     ("make", "forcing"),
     [
-        pytest.param(halves, (), marks=pytest.mark.slow(first=True)),
+        (halves, ()),
         (follows, ()),
-        pytest.param(follows, jb.Harmonic(0.5, 1.3), marks=pytest.mark.slow(first=True)),
+        (follows, jb.Harmonic(0.5, 1.3)),
     ],
 )
 def test_a_run_past_edges_at_one_place(make, forcing):

@@ -58,6 +58,7 @@ def conti():
     return jb.Conti(1.0, residual, 10.0)
 
 
+@pytest.mark.slow(first=True)
 def test_a_law_that_reads_a_global(monkeypatch):
     for value in (0.8, 0.6, 0.8):
         monkeypatch.setitem(globals(), "residual", value)

@@ -156,6 +156,7 @@ def test_its_derivatives_and_its_batches():
         np.testing.assert_allclose(slopes, -0.05 * zetas**-1.5 / np.sqrt(squares), rtol=1e-11)
 
 
+@pytest.mark.slow(first=True)
 def test_a_load_shared_by_two_belts():
     def other(load):
         mu, static = oracle.conti(1.0, 0.6, 10.0)
