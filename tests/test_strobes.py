@@ -521,6 +521,20 @@ def test_winding_numbers_of_stick_slip_motions_that_are_pushed():
         assert high - low < 1e-3 and low <= 1 / found.winding.values[row, 1] <= high
 
 
+def test_a_mass_that_stops_at_its_maximum_has_one_maximum():
+    """Where it comes to rest, x2 at the end of the step is zero up to rounding of either sign."""
+    frequencies = np.linspace(0.3, 0.5, 5)
+    found = jb.sweep(
+        jb.presets.den_hartog,
+        {"frequency": frequencies},
+        y0=(0.0, 0.0),
+        observe="attractor",
+        progress=False,
+    )
+    np.testing.assert_array_equal(found.n_events, 4)  # it stops twice in a period
+    np.testing.assert_array_equal(found.winding, 1.0)
+
+
 @pytest.mark.slow(first=True)
 def test_the_winding_number_of_a_periodic_motion_counts_its_maxima():
     """Also where one of them is at a strobe, before or behind it by rounding."""

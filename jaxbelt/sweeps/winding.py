@@ -23,6 +23,9 @@ WHOLE = 1e-7
 #: So many maxima are looked at, at least; a motion whose order is kept repeats after no fewer than
 #: one in so many of them, or never.
 FEWEST_MAXIMA, PARTS_OF_MAXIMA = 256, 16
+#: Where a step lands on a bound of its mode, the sign of a smaller |x2| is rounding: the mass may
+#: come to rest there.
+LANDED = 1e-9
 #: Newton's steps to the time of a maximum within a step.
 STEPS_TO_MAXIMUM = 3
 
@@ -30,10 +33,11 @@ STEPS_TO_MAXIMUM = 3
 class Winding(eqx.Module):
     """The maxima of x1 of a run, and the bounds of the periods between them, arrays [lanes].
 
-    rises: whether x2 was positive last; maxima: how many there were; began, first: the time of the
-    one from which bounds are counted, NaN before it, and its number; latest: periods from it to the
-    latest one; low, high: bounds of the mean number of periods between two; low_after, high_after:
-    the number of maxima after which they were first known, which is the denominator.
+    rises: whether x2 was positive when it last was not zero; maxima: number of maxima; began,
+    first: the time of the maximum from which bounds are counted, NaN before it, and its number;
+    latest: periods from it to the latest maximum; low, high: bounds of the mean number of periods
+    between two maxima; low_after, high_after: number of maxima after which each bound was first
+    known, which is its denominator.
     """
 
     rises: Array
@@ -55,8 +59,12 @@ class Winding(eqx.Module):
     def followed(
         self, lanes: Lanes, new: Lanes, course: Course, first_at: Array, period: Array, ones: Array
     ) -> "Winding":
-        """With a step; bounds are counted from the first maximum at `first_at` or later on."""
-        here = self.rises & (new.x2 <= 0)
+        """With a step; bounds are counted from the first maximum at `first_at` or later on.
+
+        Where the mass rests between its rise and its fall, the maximum is where it begins to fall.
+        """
+        rests = (new.x2 == 0) | ((new.h < 0) & (jnp.abs(new.x2) < LANDED))
+        here = self.rises & (new.x2 < 0) & ~rests
         maxima = self.maxima + here.astype(self.maxima.dtype)
         fall = lanes.x2 - new.x2
         theta = jnp.where(fall > 0, lanes.x2 / jnp.where(fall > 0, fall, 1.0), 1.0)
@@ -71,7 +79,7 @@ class Winding(eqx.Module):
         low, high = jnp.floor(periods + WHOLE) / safe, jnp.ceil(periods - WHOLE) / safe
         above, below = counts & (low > self.low), counts & (high < self.high)
         return Winding(
-            rises=new.x2 > 0,
+            rises=jnp.where(rests, self.rises, new.x2 > 0),
             maxima=maxima,
             began=jnp.where(starts, t, self.began),
             first=jnp.where(starts, maxima, self.first),
