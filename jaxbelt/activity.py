@@ -1,7 +1,7 @@
 """Progress of functions that take long, on a terminal or in a notebook, after a second.
 
 Such functions are `announced`; inside of them `note_progress` reports how far they are. If they
-call one another, the outermost one has the line. Elsewhere, in scripts and pipes, nothing is shown.
+call one another, the line is that of the outermost one. In scripts and pipes nothing is shown.
 The logger "jaxbelt" gets everything in any case: ends at the level INFO, the rest at DEBUG.
 """
 
@@ -66,7 +66,7 @@ class Activity:
 
     #: Activities that have begun and not ended, the outermost one first.
     under_way: ClassVar[list["Activity"]] = []
-    #: Names of those that ended well before, so that their programs are compiled.
+    #: Names of activities that ended without an error before: their programs are compiled.
     known: ClassVar[set[str]] = set()
     lock: ClassVar[Any] = threading.RLock()
 

@@ -48,7 +48,7 @@ class KnownNames(eqx.Module):
 
 
 def pick(tree: Any, index: Any) -> Any:
-    """The tree with every array indexed; known arrays are indexed in NumPy, which compiles
+    """The tree with every array indexed; concrete arrays are indexed in NumPy, which compiles
     nothing."""
     if is_concrete((tree, index)):
         # device_put, because jnp.asarray compiles a program for every shape.
@@ -68,7 +68,7 @@ def require(condition: Any, field: str, expected: str, got: Any) -> None:
 
 
 def require_value(condition: Any, field: str, expected: str, value: Any) -> None:
-    """`require` for a value that came itself, which may be a text."""
+    """`require` whose message has the value `in_words`, also where the value is a text."""
     if not condition:
         require(False, field, expected, in_words(value))
 
@@ -329,7 +329,7 @@ def as_array(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Arra
     """`value` as a float64 array of the given shape (None: any length), or a `ValueError`.
 
     Python numbers and integer arrays are converted; a 32-bit float is refused, because its missing
-    digits cannot be restored. Known values stay known inside a trace.
+    digits cannot be restored. Concrete values stay concrete inside a trace.
     """
     numbers = as_numbers(value, field, shape)
     if isinstance(numbers, Tracer):
@@ -358,8 +358,8 @@ def as_positive_number(value: Any, field: str) -> Array | np.ndarray:
 
 
 def as_size(value: Any, field: str) -> Array | np.ndarray:
-    """The same for a size in the user's units; None becomes NaN, which stands for the
-    oscillator's own."""
+    """`as_positive_number` for a size in the user's units; None becomes NaN, which stands for the
+    oscillator's own size."""
     return np.asarray(np.nan) if value is None else as_positive_number(value, field)
 
 
@@ -376,7 +376,7 @@ def as_tolerance(value: Any, field: str) -> float | None:
 
 
 def as_numbers(value: Any, field: str, shape: tuple[int | None, ...] = ()) -> Array | np.ndarray:
-    """Like `as_array`, but known values stay in NumPy; for arguments of compiled functions."""
+    """Like `as_array`, but concrete values stay in NumPy; for arguments of compiled functions."""
     require_usable_jax()
     given, wanted = value, "a number" if shape == () else "numbers"
     dtype = getattr(value, "dtype", None)
@@ -505,7 +505,7 @@ def number(value: Any) -> str:
 
 
 class Parameters(KnownNames):
-    """A record of parameters with rules, whose text constructs it again."""
+    """A record of parameters with rules; its repr is code that constructs it again."""
 
     def __init_subclass__(cls, **options: Any):
         super().__init_subclass__(**options)
@@ -529,8 +529,8 @@ class Parameters(KnownNames):
 
 
 def _refuse_overrides(kind: type) -> None:
-    """Raises a `TypeError` for a user's class that changes what one of this package's does, which
-    programs know by its formula."""
+    """Raises a `TypeError` for a user's subclass that overrides a public method of a class of this
+    package that is not abstract: its formula is built into programs."""
     ours = [one for one in kind.__mro__ if is_of_this_package(one)]
     if kind in ours:
         return

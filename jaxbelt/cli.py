@@ -24,7 +24,7 @@ from .spelling import near
 
 
 class Command(TyperCommand):
-    """A command that suggests an option for an unknown one, and an axis of `sweep` for some."""
+    """A command that suggests a known option, or an axis of `sweep`, for an unknown option."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         given = list(args)
@@ -34,7 +34,7 @@ class Command(TyperCommand):
             # The module of this class depends on the version of typer.
             if type(error).__name__ == "NoSuchOption":
                 name = error.__dict__["option_name"]
-                # For -nu0 the name is -n.
+                # For -nu0 the name in the error is -n.
                 words = [name] if name.startswith("--") else [one for one in given if name in one]
                 error.__dict__["possibilities"] = self._meant(words[0] if words else name)
             raise

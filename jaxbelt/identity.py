@@ -92,25 +92,25 @@ def fingerprint_or_unique(value: Any) -> Any:
 
 
 def own_parts(value: Any) -> list[Any]:
-    """The functions, classes and objects of a user's own that a value is made of, each by itself
-    and not what it reaches."""
+    """The user's own functions, classes and objects that a value is made of, without those that
+    they reach in turn."""
     reading = _Reading("a value", skips=True)
     reading.digest(value, "")
     return reading.own
 
 
 def fingerprint_of_known(value: Any) -> str:
-    """As `fingerprint`, without what cannot be known."""
+    """As `fingerprint`, but parts that have none count as unknown instead of raising."""
     return _Reading("a value", skips=True).digest(value, "")
 
 
 class _Reading:
-    """One call of `fingerprint`: the digests of the objects that were met, and of the user's own
-    ones those that no other one led to."""
+    """One call of `fingerprint`: the digests of the objects that were met; own: the user's own
+    objects that were not met inside of another one of the user's own."""
 
     def __init__(self, name: str, *, skips: bool = False):
         self.name = name
-        #: Whether what cannot be known is left out.
+        #: Whether parts that have no fingerprint count as unknown instead of raising.
         self.skips = skips
         self.own: list[Any] = []
         self.inside_own = False
@@ -120,7 +120,7 @@ class _Reading:
         self.alive: list[Any] = []
 
     def digest(self, value: Any, place: str) -> str:
-        """place: where the value was met, for messages."""
+        """Digest of a value; place: where the value was met, for messages."""
         if type(value) in REPR_TYPES:
             return _digest_of(type(value).__name__, repr(value))
         key = id(value)
@@ -236,7 +236,7 @@ class _Reading:
         cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
         names = {name: _content(cell) for name, cell in cells}
         if package:
-            # The version identifies the code of a package, but not what it was given.
+            # The version identifies the code of a package, but not the values in its closures.
             yield from (self.digest(value, f"{place}: ") for value in names.values())
             return
         for name, value in self.reads(function.__code__, function.__globals__, names, place):
@@ -361,7 +361,8 @@ def _without_caches(kind: type, state: Any) -> Any:
 
 
 def _installed_name(value: Any) -> str:
-    """Package, version and name of what an installed package or Python defines under its name."""
+    """Package, version and name of what an installed package or Python defines under its name;
+    empty for anything else."""
     if isinstance(value, ModuleType):
         package = _package_of(value.__name__)
         return f"{package} {value.__name__}" if package else ""
@@ -411,5 +412,5 @@ def _distributions() -> Any:
 
 
 def is_installed(value: Any) -> bool:
-    """Whether an installed package or Python defines a class or a function under its name."""
+    """Whether a value is a class or function that a package or Python defines under its name."""
     return _installed_name(value) != ""

@@ -9,10 +9,10 @@ from typing import Any
 
 
 class _Handler:
-    """A handler of interrupts that notes them, and raises them if so wished.
+    """A handler of interrupts that notes them, and raises them where they come if `at_once`.
 
-    Not during an import, which may be left half done, or end the process; but in one that was under
-    way when the handler was made, for whole programs may be run by an import.
+    It raises none during an import, which would be left half done or end the process, except one
+    that was under way when the handler was made, for whole programs may be run by an import.
     """
 
     def __init__(self, came: threading.Event, at_once: bool):
@@ -31,7 +31,7 @@ class _Handler:
 
 
 def _imports(frame: Any) -> int:
-    """The number of frames of imports among a frame and those that it was called by."""
+    """The number of frames of imports among a frame and its callers."""
     count = 0
     while frame is not None:
         count += frame.f_code.co_filename.startswith("<frozen importlib")
@@ -41,11 +41,11 @@ def _imports(frame: Any) -> int:
 
 @contextmanager
 def heard_interrupts(*, at_once: bool) -> Iterator[Callable[[], None]]:
-    """While the block runs no interrupt is lost; within another such block those of that one count.
+    """While the block runs no interrupt is lost; such a block inside another one shares its notes.
 
     Python raises an interrupt wherever the main thread is, and loses it in callbacks of its garbage
-    collector, such as JAX has. So it is noted, too, and raised by the function that is given, and
-    at the end of the block.
+    collector, such as JAX has. So the interrupt is noted, too, and raised by the function that the
+    block receives, and at the end of the block.
 
     Args:
         at_once: Whether interrupts are raised where they come, too.

@@ -1,7 +1,7 @@
 """The paper's table of critical velocities and its figures, recomputed: `jaxbelt reproduce`.
 
 `reproduce(folder)` finds the critical values, computes what the figures show, and draws them. The
-phase portraits before, at and after a critical value are defined in one place, their line in
+phase portraits before, at and after a critical value are defined in one place, their entry in
 `PORTRAITS`. All of them take the critical values from one tuple, that of `critical_values`.
 """
 
@@ -230,7 +230,7 @@ def _orbit(osc: Oscillator, start: tuple[float, float]) -> Trajectory:
 
 
 def _with_two_belts(osc: Oscillator) -> Oscillator:
-    """Class (a) as the limit of two belts that it is in the paper: belt 1 is out of reach."""
+    """Class (a) as the paper has it, a limit of two belts: belt 1 is out of reach."""
     if len(osc.belts) == 2:
         return osc
     beyond = Belt(0.0, paper_friction(), lower=1e6)
@@ -442,7 +442,7 @@ def diagram_a() -> BifurcationDiagram:
 
 
 def diagram_b() -> BifurcationDiagram:
-    """Diagram of Fig. 7: the same with two belts, along nu1 = 0.35."""
+    """Diagram of Fig. 7: equilibria and cycles of class (b) over nu0, along nu1 = 0.35."""
     return bifurcation_diagram(class_b(0.3, PUBLISHED_NU1), _nu0, (-0.7, 0.7))
 
 

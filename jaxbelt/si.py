@@ -421,11 +421,11 @@ def _rows_in_units(table: "pandas.DataFrame", units: Units) -> "xarray.Dataset":
 def units_along(
     result: AlongParameter, values: np.ndarray, machine: Any
 ) -> tuple[Units, tuple[str, float]]:
-    """Units at values of the parameter of a result; and the unit of the parameter, with the value
-    of 1.
+    """Units at values of the parameter of a result; and the symbol of the parameter's unit, with
+    the size of 1 in it.
 
-    The latter is "" and 1 where only the author of the function knows it. values: a number or
-    several; the units have the same shape.
+    The latter are "" and 1 where only the author of the function knows the unit. values: a number
+    or several; the units have the same shape.
     """
     if result.is_argument:
         given = {result.name: values}
@@ -453,7 +453,7 @@ def _dataset(dataset: "xarray.Dataset", machine: Any) -> "xarray.Dataset":
         of, _, by = quantity.partition(" / ")
         require_one_of(of, SI_UNITS, f"quantity of {name}")
         (symbol, size), is_axis = SI_UNITS[of], name in dataset.coords
-        # Units that vary with a parameter have a derivative, too; and the starts are one axis.
+        # Units that vary have derivatives of their own, and an axis of starts has one unit only.
         fits = not vary or not (by or is_axis)
         require(fits, "result", f"without {name} where the units of {', '.join(vary)} vary", name)
         divisor, divisor_size = SI_UNITS.get(by, (by, lambda _: 1.0))

@@ -1,4 +1,4 @@
-"""Results as tables: the form of what the method `table` of every result returns.
+"""Results as tables: the form that the method `table` of every result returns.
 
 A table is always a `pandas.DataFrame` (pandas comes with xarray). It has a row for each thing of
 one sort (samples, events, cycles, blocks), and columns of plain numbers and words: NaN where there
@@ -42,9 +42,10 @@ def per_belt(name: str, values: Any) -> dict[str, Any]:
 
 
 def require_single(result: Any, leaf: Any, *dimensions: int) -> None:
-    """Raises a `ValueError` unless a result is a single known one, as tables and pictures show.
+    """Raises a `ValueError` unless a result is a single one and not traced, as tables and pictures
+    need it.
 
-    leaf: one of its arrays; it has to be known and to have one of these numbers of dimensions.
+    leaf: one of its arrays, which has to be concrete and to have one of the given `dimensions`.
     """
     name = type(result).__name__
     require(

@@ -6,15 +6,15 @@ cycle at every parameter, the duration goes like a square root and Newton's meth
 unknowns of fixed-signature shooting (see `cycles`) the same equation is harmless.
 
 Each kind is one class that carries everything about it: its theory; a guess and the system of
-equations that Newton's method solves from there, which also judges the solution; the signs of it
-between two values on a path; the functions to watch along its curve, and where that ends; its names
-and its line in pictures. `refine`, `scan`, `bifurcation_curve`, the diagrams and the pictures ask
-the condition and know no kind. What conditions on a cycle have in common is in `conditions`, what
-those on a state of rest have in `rests`.
+equations that Newton's method solves from there, which also judges the solution; the changes of
+labels along a path that it could explain; the functions to watch along its curve, and where the
+curve ends; its names and its line in pictures. `refine`, `scan`, `bifurcation_curve`, the diagrams
+and the pictures call these methods and distinguish no kinds. What conditions on a cycle have in
+common is in `conditions`, what those on a state of rest have in `rests`.
 
-The numbers in a condition, such as its belt, are data of the compiled programs, so one program
-serves all of them: in `guess` and `system` they are arrays. A field that decides which program runs
-is static.
+The numbers in a condition, such as its belt, are arguments of the compiled programs, so one program
+serves all values: in `guess` and `prepared` they are arrays. A field that decides which program
+runs is static.
 """
 
 import abc
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     import pandas
 
 
-#: Words for the arguments of conditions.
+#: Explanations of the arguments of conditions, for error messages.
 ARGUMENTS = {
     "belt": " (the number of a belt, such as 0)",
     "belts": " (the numbers of two belts, such as (0, 1))",
@@ -86,19 +86,19 @@ class AbstractCondition(eqx.Module):
     #: Caption of a point in a diagram, with {belt} for the number of the belt; "": name of the
     #: class.
     caption: ClassVar[str] = ""
-    #: Style of its curves; the name is that of the class where it is "".
+    #: Style of the curves of the kind; an empty name stands for the name of the class.
     line: ClassVar[Line] = Line("", "black", (0, (1, 1)))
-    #: Name of the group of kinds that one curve may change between; "": this kind alone.
+    #: Name of the group of kinds that may alternate along one curve; "": this kind alone.
     group: ClassVar[str] = ""
-    #: Whether orbits beside a point converge slowly, so that it is seen from farther off only.
+    #: Whether orbits near a point converge slowly, so that labels are compared farther from it.
     slow: ClassVar[bool] = False
-    #: Whether one guess may be near to several such points, in different arcs or of other cycles.
+    #: Whether several such points may lie near one guess, in different arcs or of other cycles.
     has_several: ClassVar[bool] = False
-    #: Whether branches of a diagram go on through a point.
+    #: Whether branches of a diagram continue through a point.
     joins: ClassVar[bool] = True
-    #: Whether its curve ends where the signature changes, or such a state of rest ceases to exist.
+    #: Whether its curve ends where the signature changes, or where its state of rest vanishes.
     ends_at_contact: ClassVar[bool] = False
-    #: Whether its curve bends sharply before its limit, so that rows are needed close to that.
+    #: Whether its curve bends sharply before its limit, so that rows are needed close to the limit.
     bends: ClassVar[bool] = False
 
     def __new__(cls, *args: Any, **given: Any):
@@ -121,7 +121,7 @@ class AbstractCondition(eqx.Module):
 
     @property
     def lineage(self) -> tuple[str, tuple[int, ...]]:
-        """What stays the same along a curve: the name of the group, and the belts."""
+        """What is constant along a curve: the name of the group or the class, and the belts."""
         return self.group or type(self).__name__, self.belts_concerned
 
     @property
@@ -136,7 +136,7 @@ class AbstractCondition(eqx.Module):
         return self
 
     def named(self, point: "BifurcationPoint") -> "AbstractCondition":
-        """The condition that holds at a solution of `sought`."""
+        """The condition that holds at a solution of `sought`, a point with status OK."""
         return self
 
     def is_slow_at(self, point: "BifurcationPoint") -> bool:
@@ -144,7 +144,7 @@ class AbstractCondition(eqx.Module):
         return self.slow
 
     def covers(self, point: "BifurcationPoint") -> bool:
-        """Whether a named point is one of this condition."""
+        """Whether a point, whose condition is known, is a point of this condition."""
         other = point.condition
         is_pair = type(self) is type(other) and len(self.belts_concerned) == 2
         same_pair = is_pair and set(self.belts_concerned) == set(other.belts_concerned)
@@ -152,7 +152,7 @@ class AbstractCondition(eqx.Module):
 
     def check(self, osc: Oscillator) -> None:
         """Raises a `ValueError` if the oscillator cannot meet the condition."""
-        # Also for a field `belt` that is None.
+        # A field `belt` that is None is checked, too.
         belts = [vars(self)["belt"]] if "belt" in vars(self) else self.belts_concerned
         for belt in belts:
             check_belt(belt, len(osc.belts))
@@ -167,7 +167,7 @@ class AbstractCondition(eqx.Module):
         require(False, "osc", f"without a clock: {reason}; {other}", "one with forcing")
 
     def applied_to(self, osc: Oscillator) -> Any:
-        """The condition as the class that solves it for that oscillator."""
+        """The condition as an instance of the class that solves it for this oscillator."""
         return self.with_clock() if has_clock(osc) else self
 
     def as_data(self) -> Any:
@@ -178,15 +178,15 @@ class AbstractCondition(eqx.Module):
 
     @property
     def room(self) -> int:
-        """Room for the arcs of one loop."""
+        """Number of arcs that a loop of the guess has room for."""
         return SIZES[0]
 
     @abc.abstractmethod
     def guess(self, osc: Oscillator, size: int) -> Any:
-        """The guess from which its system of equations begins, any tree.
+        """The guess from which Newton's method starts, any pytree.
 
         It is called on the condition as data, see `as_data`, and may return a loop of a cycle, a
-        state of rest, or whatever `prepared` takes. If there is nothing to begin from, the status
+        state of rest, or whatever `prepared` takes. Where nothing can serve as a guess, the status
         of `prepared` says so. size: room for the arcs of a loop.
         """
 
@@ -194,15 +194,15 @@ class AbstractCondition(eqx.Module):
     def prepared(self, osc: Oscillator, guess: Any) -> tuple[AbstractSystem, Any, Array]:
         """The system near a guess, its unknowns there, and a status.
 
-        guess: what `guess` returned; osc: the oscillator there. The unknowns are the x of the
-        system; the status is OK, or says why there is no guess.
+        guess: what `guess` returned; osc: the oscillator of the guess. The unknowns are the x of
+        the system; the status is OK, or says why there is no guess.
         """
 
     @abc.abstractmethod
     def point_near(
         self, family: Family, system: Any, x: Any, p: Any, status: Array
     ) -> tuple["BifurcationPoint", tuple[Any, Array]]:
-        """The point near a guess (x, p) in a family of oscillators, and (x, p) there.
+        """The point near a guess (x, p) in a family of oscillators, and the solution (x, p).
 
         system, x, status: from `prepared`; p: the parameter, [1]. The condition of the point is
         `UNNAMED`; its status is that of `prepared` where that was not OK.
@@ -211,7 +211,7 @@ class AbstractCondition(eqx.Module):
     def solve(
         self, variation: Variation, osc: Oscillator, value: Any, guess: Any
     ) -> "BifurcationPoint":
-        """The point near a guess, without a name; osc: the oscillator at that value, [1]."""
+        """The point near a guess, its condition `UNNAMED`; osc: the oscillator at value, [1]."""
         system, x, status = self.prepared(osc, guess)
 
         def attempt(family, unknowns):
@@ -221,7 +221,7 @@ class AbstractCondition(eqx.Module):
         point, agrees = variation.relinearised(attempt, (x, value))
         if agrees is True and is_concrete(osc):
             return point
-        # Inside of a trace nothing was refused before.
+        # Inside a trace no earlier check has refused impossible numbers.
         possible = has_possible_numbers(osc)
         fails = (point.status == Status.OK) & ~(jnp.asarray(agrees) & possible)
         numbers = ("value", "residual", "error", "multiplier")
@@ -233,16 +233,16 @@ class AbstractCondition(eqx.Module):
     def point(
         self, variation: Variation, osc: Oscillator, value: Any, size: int
     ) -> "BifurcationPoint":
-        """The point near an oscillator, which is that at a value, [1], of the parameter."""
+        """The point found from the oscillator `osc`, at the parameter `value`, [1]."""
         data = self.as_data()
         return replace(data.solve(variation, osc, value, data.guess(osc, size)), condition=self)
 
     def named_point_from(
         self, variation: Variation, value: float, beginning: Any = None
     ) -> "BifurcationPoint | None":
-        """The point that is found from this value of the parameter, with its name, or None.
+        """The point found from this value of the parameter, with its kind named; None if it fails.
 
-        beginning: one of `beginnings`.
+        beginning: one of `beginnings`; None: the condition's own guess.
         """
         point = self.point_from(variation, value, beginning)
         if int(point.status) != Status.OK:
@@ -252,21 +252,21 @@ class AbstractCondition(eqx.Module):
     def named_point_beside(
         self, variation: Variation, value: float, osc: Oscillator, system: Any, x: Any
     ) -> "BifurcationPoint | None":
-        """The point that is found from this value, with its name, or None, where one beside it is
-        known: the unknowns x of a system, at an oscillator."""
+        """Like `named_point_from`, where a neighbouring point is known: its oscillator, its system,
+        and the unknowns x of the system."""
         return self.named_point_from(variation, value)
 
     def point_from(
         self, variation: Variation, value: float, beginning: Any = None
     ) -> "BifurcationPoint":
-        """Like `named_point_from`, but without a name, and whatever the status."""
+        """Like `named_point_from`, but with the condition `UNNAMED`, and with any status."""
         data, start = self.sought.as_data(), np.array([value])
         osc = variation.oscillator(start)
         guess = data.guess(osc, data.room) if beginning is None else data.guess_near(beginning)
         return data.solve(variation, osc, start, guess)
 
     def guess_near(self, beginning: Any) -> Any:
-        """The guess from a known motion: one of `beginnings`."""
+        """The guess from a known motion, one of `beginnings`."""
         raise NotImplementedError
 
     # --- on a path ---
@@ -275,43 +275,42 @@ class AbstractCondition(eqx.Module):
     def between(
         cls, before: Label, after: Label, edged: Sequence[int]
     ) -> Sequence["AbstractCondition"]:
-        """Conditions of this kind that could make the difference between two labels.
+        """Conditions of this kind that could explain the difference between two labels.
 
-        edged: belts with a finite contact edge, one for each place.
+        edged: belts with load and a finite contact edge, one for each set of shared edges.
         """
         return ()
 
     @classmethod
     def at_coincidence(cls, belts: tuple[int, ...]) -> Sequence["AbstractCondition"]:
-        """Conditions that could hold where a belt is at rest, or two belts have one velocity."""
+        """Conditions that could hold where one belt is at rest, or two belts have one velocity."""
         return ()
 
     @classmethod
     def at_meeting(
         cls, belts: tuple[int, ...], before: Label, after: Label
     ) -> Sequence["AbstractCondition"]:
-        """Conditions that could make the difference where contact edges of two belts meet."""
+        """Conditions that could explain a difference where contact edges of two belts meet."""
         return ()
 
     @classmethod
     def of_unstable_cycles(cls, edged: Sequence[int]) -> Sequence["AbstractCondition"]:
-        """Conditions that could make the difference between the modes of two unstable cycles."""
+        """Conditions that could explain a difference between the modes of two unstable cycles."""
         return ()
 
     def mark(self, osc: Oscillator, cycles: Sequence[Loop]) -> Hashable:
-        """Value that changes where the condition holds, in addition to a label.
+        """Part of a label: a value that changes where the condition holds.
 
-        cycles: the attracting ones, in order.
+        cycles: loops of the attracting cycles, in order.
         """
         return None
 
     def beginnings(self, osc: Oscillator, cycles: Sequence[AttractingCycle]) -> Sequence[Any]:
-        """Motions to begin from, such as loops of the attracting cycles; None stands for its own
-        guess."""
+        """Motions to start from, such as loops of the attracting cycles; None: the own `guess`."""
         return (None,)
 
     def values(self, a: float, b: float) -> Sequence[float]:
-        """Values of the parameter to begin from, if the condition may hold between two values."""
+        """Values of the parameter to start from if the condition may hold between a and b."""
         return a, b
 
     # --- along a curve ---
@@ -321,11 +320,11 @@ class AbstractCondition(eqx.Module):
         """The system to follow from a point, and its unknowns there."""
 
     def kind_along(self, osc: Oscillator, multiplier: float) -> type["AbstractCondition"]:
-        """The kind that holds at a point of its curve."""
+        """The kind that holds at a point of the curve of this condition."""
         return type(self)
 
     def limit(self, trail: Trail) -> SpecialPoint | None:
-        """The point in which its curve ends where there is no such motion, if that is near."""
+        """The special point, if near, in which its curve ends as the motion ceases to exist."""
         return None
 
     def place(self, point: "BifurcationPoint") -> np.ndarray:
@@ -361,12 +360,12 @@ class BifurcationPoint(eqx.Module):
             where it does not stick to the belt; else NaN.
         x1: Displacement of the mass at rest, where the equations determine it; else NaN.
         oscillator: The oscillator at the point.
-        cycle: The cycle at the point; its status says why, where there is none (at a Hopf point it
+        cycle: The cycle at the point. Where there is none, its status says why (at a Hopf point it
             has shrunk to the equilibrium, at `SuddenSliding` its period is infinite).
         status: A `Status` code.
         member: Number of the state of rest, as its condition counts them.
-        sides: Where something changes that no condition explains, what there is below the value and
-            above it, two of `Side`; else ().
+        sides: For a change that no condition explains, the `Side` below the value and the one
+            above it; else ().
     """
 
     condition: AbstractCondition = eqx.field(static=True)
@@ -385,14 +384,14 @@ class BifurcationPoint(eqx.Module):
 
     @property
     def _own(self) -> "BifurcationPoint":
-        """The point in own units, in which its condition works."""
+        """The point in the oscillator's own units, in which its condition works."""
         own = in_own_units(self.oscillator)
         if own is self.oscillator:
             return self
         return rescaled(self, 1 / own.units.length, lambda _: own)
 
     def _back(self, value: Any, *dimensions: str) -> Any:
-        """A result of the condition for `_own`, in the units of the point."""
+        """A result of the condition for `_own`, converted to the units of the point."""
         own = in_own_units(self.oscillator)
         return value if own is self.oscillator else own.units.back(value, *dimensions)
 
@@ -407,13 +406,13 @@ class BifurcationPoint(eqx.Module):
 
         "supercritical" or "subcritical" for `Hopf` and `PseudoHopf`: the cycle that is born
         attracts or repels ("degenerate": the coefficient is zero, or the fixed point lies on a
-        contact edge, where there is none). "persistence" or "annihilation" for
+        contact edge, where there is no coefficient). "persistence" or "annihilation" for
         `BoundaryEquilibrium`: there is an equilibrium on both sides of the point, or two meet and
-        vanish ("degenerate": another one lies there, too). "crossing" or "buckling" for
+        vanish ("degenerate": another equilibrium lies there, too). "crossing" or "buckling" for
         `CrossingSliding`: a stick phase ceases to exist, or the boundary is crossed once more
-        before it ("jump": for long at once). "homoclinic" or "heteroclinic" for `SaddleConnection`:
-        it leads back to the same saddle or to another one. "" where the kind has one type, or no
-        point was found.
+        before it ("jump": the orbit goes far beyond the boundary at once). "homoclinic" or
+        "heteroclinic" for `SaddleConnection`: it leads back to the same saddle or to another one.
+        "" where the kind has one type, or no point was found.
         """
         require_single(self, self.value, 0)
         return self._solved.type_of(self._own) if int(self.status) == Status.OK else ""
@@ -496,7 +495,7 @@ class BifurcationPoint(eqx.Module):
                 advice = f"{advice} Below, {below!r}; above, {above!r}."
             elif "jb.scan" not in advice:
                 advice += " Every bifurcation point in an interval is found by jb.scan."
-            # Where only the kind is unknown, the place is known up to `error`.
+            # Where only the kind is unknown, the value is known up to `error`.
             value, error = f"value {number(self.value)}", float(self.error)
             value = f"{value}, error < {error:.1e}" if np.isfinite(error) else value
             return f"BifurcationPoint({self.condition!r}, {value}, {name}: {advice})"
@@ -509,7 +508,7 @@ class BifurcationPoint(eqx.Module):
 
 
 def given_point(point: BifurcationPoint, variation: Variation) -> BifurcationPoint:
-    """A point that was found in own units, in the units of the given variation."""
+    """A point that was found in own units, converted to the units of the given variation."""
     if variation.units is None:
         return point
     given, length, (unit,), _ = variation.units
@@ -528,10 +527,10 @@ def _given_side(side: Side, variation: Variation) -> Side:
 
 
 class Unexplained(AbstractCondition):
-    """What the oscillator does changes, and no other condition explains it; from `scan` only.
+    """The motions change and no other condition explains it; only `scan` returns such points.
 
-    The point's `sides` say what there is below its value and above, and how far the branches that
-    end there are from one another, see `Side`. Under a law that falls within a hundredth of the
+    The point's `sides` say what there is below its value and above, and how far apart the branches
+    are that end there, see `Side`. Under a law that falls within a hundredth of the
     belt's velocity the end of stick-slip is such a point: the fold in which a sticking cycle ends
     is squeezed together with a canard.
     """
@@ -551,7 +550,7 @@ class Unexplained(AbstractCondition):
         raise ValueError(f"point must be of a kind that has curves, got {self!r}")
 
 
-#: Compiled programs return points without a name, as a name would be a constant in them.
+#: Condition of points from compiled programs: a named one would be a constant of the program.
 UNNAMED = Unexplained()
 
 

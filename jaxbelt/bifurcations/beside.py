@@ -1,11 +1,11 @@
-"""What there is on the two sides of a change that no condition explains: `Side`.
+"""The motions on the two sides of a change that no condition explains: `Side`.
 
-A branch of cycles that ends there is described by its last cycle. Two numbers say how it ends: how
-far it is from what its orbits lead to on the other side, and how far from the largest loop within
-it that comes to rest. Where a branch of cycles ends in a fold both of its branches come together,
-and the second number goes to zero. Under a very steep law the unstable branch follows the boundary
-of the belt through the thin layer of the law, as a canard, at a multiplier that no number holds:
-there the branches stop apart.
+A branch of cycles that ends there is described by its last cycle. Two numbers say how the branch
+ends: the distance of this cycle from the motion that its orbits lead to on the other side, and its
+distance from the largest loop inside it that comes to rest. Where the branch ends in a fold, the
+attracting and the unstable cycle come together, and the second number goes to zero. Under a very
+steep law the unstable branch follows the boundary of the belt through the thin layer of the law, as
+a canard, with a multiplier too large for a float: there the two branches end apart.
 """
 
 from collections.abc import Sequence
@@ -29,13 +29,13 @@ from .labels import AttractingCycle
 
 
 class Side(eqx.Module):
-    """What there is beside a point of kind `Unexplained`, on one side.
+    """The motions on one side of a point of kind `Unexplained`.
 
-    value: of the parameter, there; equilibria: all of them; cycles: the attracting ones that do not
-    go on to the other side, a tuple of `Cycle`. jumps, [cycles]: how far the extrema of x1 are from
-    those of what the cycle's orbits lead to on the other side. inside, [cycles]: how far the top of
-    the cycle is from that of the largest loop within that comes to rest; where both branches of a
-    fold come together this is near zero. NaN: not known.
+    value: the parameter on this side; equilibria: all of them; cycles: the attracting `Cycle`s that
+    do not continue on the other side. jumps: distance of the extrema of x1 of each cycle from those
+    of the motion that its orbits lead to on the other side, [cycles]. inside: distance of the
+    largest x1 of each cycle from that of the largest loop inside it that comes to rest, [cycles],
+    near zero where both branches of a fold come together. NaN: not known.
     """
 
     value: Array
@@ -64,7 +64,7 @@ def sides_of(
     oscs: tuple[Oscillator, Oscillator],
     cycles: tuple[Sequence[AttractingCycle], Sequence[AttractingCycle]],
 ) -> tuple[Side, Side]:
-    """Both sides of a change between two values close together; cycles: those that attract."""
+    """The sides below and above a change between two close values; cycles: the attracting ones."""
     known = [[one for one in some if one.path] for some in cycles]
     places = [[place_of(one.loop) for one in some] for some in known]
     first, last = (
@@ -84,7 +84,7 @@ def _side_at(value, osc, across, cycles, places, others, other_places) -> Side:
             for other, at in zip(others, other_places, strict=True)
         )
     ]
-    # Of one that Newton's method does not close no number is known.
+    # A cycle that Newton's method does not close has no numbers to report.
     ended = [cycle for cycle in ended if int(cycle.status) == Status.OK]
     tops = _tops_that_come_to_rest(osc, rests)
     return Side(
@@ -97,7 +97,7 @@ def _side_at(value, osc, across, cycles, places, others, other_places) -> Side:
 
 
 def _jump(osc: Oscillator, cycle: Cycle) -> float:
-    """How far the extrema of x1 are from those of what its orbits lead to elsewhere."""
+    """Distance of the extrema of x1 from those of the motion that its orbit leads to in `osc`."""
     ends = np.array([float(cycle.x1_min), float(cycle.x1_max)])
     found = cycle_from(osc, np.asarray(cycle.unknowns)[0, :2])
     if int(found.status) == Status.OK:
@@ -107,13 +107,13 @@ def _jump(osc: Oscillator, cycle: Cycle) -> float:
     rests = equilibria(osc)
     settles = np.asarray(rests.stable) & (np.asarray(rests.kind) > 0)
     x1 = np.asarray(rests.x1)[settles]
-    # Of several the one within the cycle; what lies farther off is a jump, too.
+    # Of several equilibria the one within the cycle is nearest; one farther off is a jump, too.
     away = [float(np.max(np.abs(ends - at))) for at in x1]
     return min(away, default=float("nan"))
 
 
 def _tops_that_come_to_rest(osc: Oscillator, rests: Equilibria) -> list[float]:
-    """The largest x1 of the largest loop around each stable equilibrium that comes to rest."""
+    """Largest x1 of the largest loop that comes to rest, around each stable equilibrium."""
     meant = np.asarray(rests.stable) & (np.asarray(rests.kind) > 0)
     meant &= np.asarray(rests.kind) != EquilibriumKind.SEGMENT
     tops = []

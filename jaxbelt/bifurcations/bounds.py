@@ -1,11 +1,11 @@
 """The curves that bound the regions of a plane of two parameters: `Bounds`.
 
-Points are found by `scan` along a few lines across the plane, and their curves are followed. Curves
-that no line meets are missing then. So cells are compared: where two neighbours differ and no curve
-passes between them, the points between these two are searched and their curves followed, until
-there is no such pair left, or only pairs between which nothing is found. At last every end of a
-curve gets a name: if it has none of its own, that of the point of codimension two in which it meets
-another curve.
+Points are found by `scan` along a few lines across the plane, and their curves are followed. This
+misses curves that no line meets. Therefore cells are compared: where two neighbours differ and no
+curve passes between them, the points on the line between them are searched and their curves
+followed, until no such pair is left, or only pairs between which nothing is found. At last every
+end of a curve gets a name: where it has none, the end is named after the point of codimension two
+in which the curve meets another one.
 """
 
 from collections.abc import Sequence
@@ -28,36 +28,36 @@ from .path import ParameterPath
 from .scan import calls_ahead, search
 from .special import SpecialPoint, is_elsewhere
 
-#: A curve bounds two neighbouring cells if it passes the line between them this near, in cells:
-#: chords of a bent curve are off by less.
+#: A curve bounds two neighbouring cells if it passes the line between them this near, in cells: the
+#: chords of a bent curve miss the curve itself by less.
 PASSES_BY = 0.1
-#: A pair between which nothing is found stands for others of the same two motions this near, in
-#: cells.
+#: If nothing is found between two cells, other pairs with the same two motions that are this near,
+#: in cells, are not searched either.
 ALIKE = 3.0
-#: Number of points for each cell, on the line between two cells and on a curve, whose distances are
-#: computed.
+#: Number of points per cell at which distances are computed, on the line between two cells and on
+#: curves.
 PER_CELL = 8
 #: Number of values at which the search between two cells begins.
 BETWEEN = 6
 
-#: Number of successive rows of a curve on another one from which both count as one curve.
+#: Curves count as one where this many successive rows of one of them lie on the other.
 DOUBLED = 4
-#: Places of one cycle in rows of two curves that are a step apart differ by less, relative to its
-#: size.
+#: Places of the same cycle, in rows of two curves that are a step apart, differ by less than this,
+#: relative to its size.
 SAME_PLACE = 0.05
-#: A curve ends in a known point that is no farther than MEETS steps if its last END_ROWS rows lead
-#: past it at no more than this part (MISSES) of the distance.
+#: A curve ends in a known point at most MEETS steps away if the parabola through its last END_ROWS
+#: rows misses the point by no more than MISSES times the distance.
 MEETS, MISSES, END_ROWS = 4.0, 0.2, 4
 
-#: Two neighbouring cells, the parameters of each.
+#: Two neighbouring cells: the parameters (p, q) of each.
 Pair = tuple[tuple[float, float], tuple[float, float]]
 
 
 class Bounds:
     """The curves in a plane, found so far.
 
-    variation: of both parameters; values: of each, increasing; step: between the points of curves,
-    in units in which both sides have the length 1.4.
+    variation: of both parameters; values: the values of each along its axis, increasing; step:
+    between the points of curves, in units in which both sides of the plane have the length 1.4.
     """
 
     def __init__(self, variation: Variation, values: Sequence[np.ndarray], step: float):
@@ -71,7 +71,7 @@ class Bounds:
         self.curves: list[BifurcationCurve] = []
 
     def search_lines(self, lines: int) -> None:
-        """Follows the curves of all points on so many lines parallel to each axis."""
+        """Follows the curves of all points on `lines` lines parallel to each axis."""
         across = [
             (along, float(fixed))
             for along in (0, 1)
@@ -89,17 +89,17 @@ class Bounds:
                 self._follow(found.result(), along, fixed, source)
 
     def search_between(self, motions: np.ndarray, left_out: np.ndarray) -> tuple[Pair, ...]:
-        """Follows the curves between neighbouring cells that differ; returns the pairs without any.
+        """Follows curves between neighbouring cells that differ; returns pairs without any curve.
 
-        motions: a number for the motions in each cell, [n, m], negative where these are not known;
-        left_out: cells that are not compared, [n, m].
+        motions: a number for the motions in each cell, [n, m], negative where they are not known;
+        left_out: mask of cells that are not compared, [n, m].
         """
         rows = neighbours_that_differ(motions, left_out)
         rows = rows[self.away(rows) > PASSES_BY]
         untried = np.ones(len(rows), bool)
         while np.any(untried):
             away = np.where(untried, self.away(rows), -1.0)
-            # The pair farthest from known curves, and so from points of codimension two on them.
+            # Next: the pair farthest from known curves, and so from points of codimension two.
             at = int(np.argmax(away))
             row, column, along = rows[at].tolist()
             note_progress(
@@ -119,7 +119,7 @@ class Bounds:
         return tuple(self.pair(row) for row in rows.tolist())
 
     def name_ends(self) -> None:
-        """Names ends without a name after the point in which they meet another curve."""
+        """Names each end without a name after the point in which it meets another curve."""
         for number, curve in enumerate(self.curves):
             others = [other for other in self.curves if other is not curve]
             known = [point for other in others for point in other.special]
@@ -130,10 +130,10 @@ class Bounds:
             self.curves[number] = curve
 
     def _points(self, along: int, fixed: float, ends, resolution: int = 0):
-        """Points on a line parallel to an axis, the other parameter being fixed."""
+        """Points on a line along the axis `along`, the other parameter being fixed."""
         span = float(ends[0]), float(ends[1])
         path = ParameterPath(self.variation.held(1 - along, fixed), None, span, basins=False)
-        if resolution:  # a short line, which is searched farther off, too
+        if resolution:  # a short line: Newton's method starts from intervals of any width
             return search(path, resolution, near=1.0)
         with compiled_beside("scan", path.at(path.first), calls_ahead(path)):
             return search(path)
@@ -141,8 +141,7 @@ class Bounds:
     def _follow(
         self, points: Sequence[BifurcationPoint], along: int, fixed: float, source: str
     ) -> None:
-        """Follows the curves of points that are on no known curve; source: words for their
-        origin."""
+        """Follows the curves of points on no known curve; source: their origin, in words."""
         for point in points:
             note_progress(f"{len(self.curves)} curves from {source}")
             pair = np.empty(2)
@@ -150,13 +149,13 @@ class Bounds:
             if point.status == Status.OK and not any(
                 _lies_on(point, pair, curve, self.step, self.unit) for curve in self.curves
             ):
-                # As `step`, in the units in which curves are followed.
+                # `self.step` in the units in which curves are followed.
                 step = self.step * np.max(self.unit / self.variation.family(pair).units)
                 curve = follow_point(self.variation, point, pair, self.limits, step=float(step))
                 self.curves.append(_without_known(curve, pair, self.curves, self.step, self.unit))
 
     def away(self, rows: np.ndarray) -> np.ndarray:
-        """Distance of the nearest curve from the line between the two cells, in cells, [pairs]."""
+        """Distance of the nearest curve from the line between two cells, in cells, [pairs]."""
         from scipy.spatial import KDTree  # late, as only maps need it
 
         if not self.curves or not len(rows):
@@ -190,7 +189,7 @@ def neighbours_that_differ(motions: np.ndarray, left_out: np.ndarray) -> np.ndar
 
 
 def _alike(rows: np.ndarray, at: int, motions: np.ndarray) -> np.ndarray:
-    """Which pairs have the same two motions as this one, and are near to it."""
+    """Mask of the pairs that are near to the pair `at` and have the same two motions, [pairs]."""
     first = motions[rows[:, 0], rows[:, 1]]
     second = motions[rows[:, 0] + (rows[:, 2] == 0), rows[:, 1] + (rows[:, 2] == 1)]
     low, high = np.minimum(first, second), np.maximum(first, second)
@@ -205,9 +204,9 @@ def _without_known(
     step: float,
     unit: np.ndarray,
 ) -> BifurcationCurve:
-    """The part of a curve, around its beginning, that is on no other curve.
+    """The part of a curve, around its start, that lies on no known curve.
 
-    Curves of one kind that meet in a point of codimension two may go on as one.
+    Curves of one kind may coincide beyond a point of codimension two in which they meet.
     """
     doubled = np.zeros(len(curve), bool)
     for other in known:
@@ -215,7 +214,7 @@ def _without_known(
             doubled |= _rows_on(curve, other, 0.02 * step, unit)
     begun = int(np.argmin(np.hypot(*((curve.values - start) / unit).T)))
     first, last = 0, len(curve) - 1
-    # A few rows may be near where two curves cross.
+    # Where two curves cross, a few rows of one may lie near the other.
     for row in range(begun, -1, -1):
         if row >= DOUBLED and np.all(doubled[row - DOUBLED + 1 : row + 1]):
             first = min(row + 1, begun)
@@ -230,7 +229,7 @@ def _without_known(
 def _rows_on(
     curve: BifurcationCurve, other: BifurcationCurve, near: float, unit: np.ndarray
 ) -> np.ndarray:
-    """Which rows of a curve are on another one, with the motion at the same place, [rows]."""
+    """Mask of the rows of a curve that lie on another one, with the same motion, [rows]."""
     path, rows, found = other.path / unit, other.values / unit, np.zeros(len(curve), bool)
     for row, (at, place) in enumerate(zip(curve.values / unit, curve.places, strict=True)):
         away, _ = from_chords(at, path)
@@ -240,13 +239,13 @@ def _rows_on(
 
 
 def _shortened(curve: BifurcationCurve, first: int, last: int) -> BifurcationCurve:
-    """The part of a curve from one of its rows to another."""
+    """The part of a curve from its row `first` to its row `last`, both included."""
     if (first, last) == (0, len(curve) - 1):
         return curve
     special, row = [], -1
     for item in curve.in_order():
         if isinstance(item, SpecialPoint):
-            # Special points between the last row left out and the first one kept are its ends.
+            # Special points between a row left out and the first or last row kept are its ends.
             if first - 1 <= row <= last:
                 special.append(item)
         else:
@@ -275,10 +274,10 @@ def _meeting_at_end(
     step: float,
     unit: np.ndarray,
 ) -> SpecialPoint | None:
-    """The known point in which a curve ends, if its end has no other reason.
+    """The known point in which a curve ends, unless its end has a reason or a name already.
 
     end: 0 for its first row, -1 for its last one. The point has to be near, and a parabola through
-    the last rows has to lead there.
+    the last rows has to lead to it.
     """
     if curve.ends[end] in (Stop.LEFT_SPAN, Stop.CLOSED) or curve.is_named(end):
         return None
@@ -286,7 +285,7 @@ def _meeting_at_end(
     rows = values[:END_ROWS] if end == 0 else values[::-1][:END_ROWS]
     gone = np.append(0.0, np.cumsum(np.hypot(*np.diff(rows, axis=0).T)))
     degree = min(2, len(rows) - 1)
-    # Where the curve was cut it may have gone a little beyond.
+    # A curve that was cut may have gone a little beyond the point.
     ahead = np.linspace(step, -MEETS * step, 200)
     fits = [np.polyfit(gone, column, degree) for column in rows.T]
     path = np.column_stack([np.polyval(fit, ahead) for fit in fits])
@@ -307,7 +306,7 @@ def _lies_on(
     step: float,
     unit: np.ndarray,
 ) -> bool:
-    """Whether a point is on a known curve."""
+    """Whether a point, at parameters `at`, lies on a known curve of its own kind and belts."""
     if point.condition.lineage != curve.condition.lineage:
         return False
     return is_on_rows(at / unit, point.place, curve.values / unit, curve.places, 0.3 * step)

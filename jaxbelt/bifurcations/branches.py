@@ -1,11 +1,11 @@
 """Branches of periodic motions of forced oscillators along one parameter: `forced_branches`.
 
 A branch with a fixed signature is a curve in the unknowns of its motions and the parameter, which
-pseudo-arclength follows, round folds, too. Between two points of it functions of multipliers may
-change their signs; then that point is solved for. Where the motion leaves its signature, the
-conditions on sliding are solved from the last motion before, and the nearest of their points is
-where the branch goes on with another signature: to the other side of the point, or back on the same
-one. At a period doubling, and where symmetry breaks, the other branches that meet this one there
+pseudo-arclength follows, round folds, too. Where a function of the multipliers changes its sign
+between two motions, the point between them is solved for. Where a motion leaves its signature, the
+conditions on sliding and on edges are solved from the last motion before, and at the nearest of
+these points the branch continues with another signature: on the other side of the point, or back on
+the same one. At a period doubling, and where symmetry breaks, the other branches that meet this one
 are followed, too.
 """
 
@@ -43,48 +43,49 @@ from .symmetry import SymmetryBreaking, asymmetry_of, image_of, is_symmetric
 from .tangencies import GrazingSliding
 from .timed_systems import unit_circle_tests
 
-#: First, shortest and longest step, of which the parameter's part is measured in parts of the span.
+#: First, shortest and longest step; a step's change of the parameter is relative to the span.
 FIRST_STEP_OF_BRANCH, SHORTEST_STEP_OF_BRANCH, LONGEST_STEP_OF_BRANCH = 2e-3, 1e-7, 2e-2
-#: The conditions on sliding are solved again only where steps have become so much shorter.
+#: The conditions on sliding are solved again only when steps are shorter by this factor.
 SEARCH_AGAIN = 2e-3
-#: Rows after one that was none before steps become longer again.
+#: Number of rows after a failed one before steps become longer again.
 STRAIGHT_ROWS = 3
-#: Cosine of the largest angle between tangents of neighbours.
+#: Smallest cosine of the angle between the tangents of neighbouring motions.
 STRAIGHT_BRANCH = 0.95
-#: Steps on each side at most.
+#: Largest number of motions on each side.
 MOST_MOTIONS = 400
-#: So many times as large as the first motion of a branch, and 1, a motion grows beyond all bounds.
+#: A motion counts as unbounded if it is larger than 1 + the first one of its branch by this factor.
 UNBOUNDED = 1e3
-#: Parts of the span, of its length, in which no branch is, where another one is looked for, and how
-#: often it is.
+#: A gap wider than WIDE_GAP of the span that no branch reaches is searched for another branch, at
+#: most MOST_FURTHER times.
 WIDE_GAP, MOST_FURTHER = 0.02, 4
-#: How far beyond a point a motion with another signature is looked for, in parts of the span.
+#: Distances beyond a point where motions with another signature are sought, in parts of the span.
 BEYOND_POINT = (1e-5, 1e-4, 1e-3)
-#: Shares of a period at which motions are looked for.
+#: Phases, as fractions of a period, at which guesses for motions are made.
 SOME_PHASES = (0.0, 0.25, 0.5, 0.75)
-#: States that a branch reaches beyond a point are no farther than this from it.
+#: A motion beyond a point is accepted if its state at the phase 0 is this near to the point's.
 NEAR_POINT = 0.1
-#: Of two motions that follow one another the way between them is straight up to this part.
+#: A motion is between two successive ones if it is off their chord by at most this part of it.
 STRAIGHT_WAY = 0.1
-#: Halves of a motion that are alike up to this part of what they were before are one.
+#: The halves of a motion are equal if they differ by less than this part of what they did before.
 GONE_OVER = 1e-4
-#: States of a motion that differ by less from those half of its periods later, or of its image: a
-#: point is near in which it has left another one.
+#: If a motion differs by less than this from itself half of its periods later, or from its image, a
+#: point is near in which it has left another motion.
 ALIKE_HALVES = 0.03
-#: Multipliers of two motions, between which events change and nothing else happens, differ by less,
-#: over 1 and their size.
+#: Largest difference of the multipliers, over 1 + their size, of two motions of one branch between
+#: which only events change.
 ALIKE_MULTIPLIERS = 0.1
-#: How far from a point motions that leave another one there, and that one, are looked for.
+#: Distances from a point at which motions that leave another one, and that other one, are sought.
 LEAVES = (1e-3, 1e-2, 5e-2)
 
 
 def forced_branches(
     line: ForcedLine, begun: MotionRow, further: Callable[[float], MotionRow | None] | None
 ) -> tuple[list[MotionBranch], list[BifurcationPoint]]:
-    """The branch of a motion at a value, within a span, to both sides, and those that meet it in
-    period doublings and where symmetry breaks; and the points on them. All in own units.
+    """The branches from a motion within a span, and the points on them, all in own units.
 
-    further: finds a motion at a value that no branch reaches, whose branch is followed, too.
+    These are the branch of `begun`, to both sides, and those that meet it in period doublings and
+    where symmetry breaks. further: finds a motion, whose branch is followed, too, at a value that
+    no branch reaches.
     """
     branches, found, waiting = [], [], [(begun, True)]
     looked = 0
@@ -113,19 +114,19 @@ def forced_branches(
 
 
 def _is_on_branch(line: ForcedLine, row: MotionRow, branch: MotionBranch) -> bool:
-    """Whether a motion is one of a branch."""
+    """Whether a motion belongs to a branch."""
     near = min(branch.rows, key=lambda one: abs(one.value - row.value))
-    # Where a symmetric motion, an asymmetric one and its image meet, Newton's method goes from one
-    # to another.
+    # Where a symmetric motion, an asymmetric one and its image meet, Newton's method may converge
+    # to any of them.
     if line.is_symmetric and _side_of_symmetry(line, row) != _side_of_symmetry(line, near, row):
         return False
     return _has_passed(branch.rows, row.value, line.at(row.value), row.motion)
 
 
 def _side_of_symmetry(line: ForcedLine, row: MotionRow, like: MotionRow | None = None) -> float:
-    """0 for a symmetric motion; 1, or -1 if it is asymmetric in the other sense than another one.
+    """0 for a symmetric motion; for an asymmetric one the sign of its asymmetry relative to `like`.
 
-    Motions of an even number of periods have no sense.
+    1 where there is no `like` to compare with, and for motions of an even number of periods.
     """
     osc = line.at(row.value)
     away = asymmetry_of(osc, row.motion)
@@ -136,7 +137,7 @@ def _side_of_symmetry(line: ForcedLine, row: MotionRow, like: MotionRow | None =
 
 
 def _widest_gap(line: ForcedLine, branches: list[MotionBranch]) -> tuple[float, float]:
-    """The width and the middle of the widest part of the span that no branch reaches."""
+    """Width and middle of the widest interval of the span that no branch reaches."""
     ranges = [[row.value for row in one.rows] for one in branches] + [[line.last]]
     reached, gaps = line.first, []
     for low, high in sorted((min(values), max(values)) for values in ranges):
@@ -178,13 +179,13 @@ def _side_of_point(
 def _branch_leg(
     line: ForcedLine, behind: list[MotionRow], sign: float
 ) -> tuple[list[MotionRow], list[BifurcationPoint], tuple[MotionRow, float] | float | None]:
-    """The motions after the last one behind with its signature, the points on the way, and how it
-    goes on.
+    """The motions after the last one of `behind` with its signature, the points among them, and how
+    the branch goes on.
 
-    Where the signature ends that is the first motion with another one, and the sense in which the
-    parameter goes from it. It is None where the branch leaves the span, or ends in a point (also
-    where it comes back to the branch that it has left in a period doubling), or has come back to
-    the first motion behind, which is then its last row; and a value where it ends otherwise.
+    Where the signature ends: the first motion with another one, and the sense in which the
+    parameter goes from it. None where the branch leaves the span, ends in a point (also where it
+    comes back to the branch that it has left in a period doubling), or comes back to the first
+    motion of `behind`, then its last row. A value of the parameter where it ends otherwise.
     """
     home, row = behind[0], behind[-1]
     leg, begun = MotionLeg.begun(line, row)
@@ -271,7 +272,7 @@ def _tests(motion: PeriodicMotion) -> dict[type[AbstractForcedCondition], float]
 def _points_between(
     line: ForcedLine, one: MotionRow, other: MotionRow
 ) -> Iterator[BifurcationPoint]:
-    """The points of multipliers between two motions of one signature."""
+    """The points between two motions of one signature where multipliers meet the unit circle."""
     before, after = _tests(one.motion), _tests(other.motion)
     for kind in before:
         if not before[kind] * after[kind] < 0:
@@ -296,8 +297,8 @@ def _points(
 def _is_between(
     line: ForcedLine, point: BifurcationPoint, one: MotionRow, value: float, start: np.ndarray
 ) -> bool:
-    """Whether a point is as near to a motion as another value, and another state at the phase 0,
-    are to it, about."""
+    """Whether a point is about as near to the motion `one` as the value and the state `start` (at
+    the phase 0) are."""
     apart = np.max(np.abs(np.asarray(one.motion.start) - start)) + 1e-6
     reach = 2 * abs(value - one.value) + 2 * LONGEST_STEP_OF_BRANCH * line.length
     away = np.max(np.abs(np.asarray(point.cycle.start) - np.asarray(one.motion.start)))
@@ -305,17 +306,20 @@ def _is_between(
 
 
 def _merging_between(line: ForcedLine, last: MotionRow, new: MotionRow) -> BifurcationPoint | None:
-    """The point in which a branch ends between two of its motions, as behind it come its own again,
-    half of their periods later: those of a period doubling, and, as images, those that have left a
-    symmetric motion. So the point has been passed where both have changed places; and it is near
-    where both are alike, and the new motion is not known, for Newton's method is singular there."""
+    """The point between two successive motions in which a branch merges with the one it has left.
+
+    Behind a period doubling the branch has its own motions again, half of their periods later;
+    behind a symmetry breaking it has their images. So the point has been passed where both halves,
+    or the motion and its image, have changed places. It is near where both are alike and `new` was
+    not found, as Newton's method is singular there.
+    """
     is_known = int(new.motion.status) == Status.OK
     for condition in (PeriodDoubling(), SymmetryBreaking()):
         halves = _apart(line, condition, last)
         if halves is None:
             continue
         ahead, size = _apart(line, condition, new) if is_known else None, np.max(np.abs(halves))
-        # Newton's method may also have gone over to the motion that the branch has left.
+        # Newton's method may also have converged to the motion that the branch has left.
         is_over = ahead is None or np.max(np.abs(ahead)) < GONE_OVER * size
         if is_known and not is_over and np.sum(halves * ahead) >= 0:
             continue
@@ -335,7 +339,7 @@ def _merging_between(line: ForcedLine, last: MotionRow, new: MotionRow) -> Bifur
 
 
 def _is_on_the_way(one: MotionRow, last: MotionRow, new: MotionRow) -> bool:
-    """Whether a motion is one between two others that follow one another on a branch."""
+    """Whether the motion `one` lies between two successive motions of a branch."""
     change, periods = new.value - last.value, last.motion.periods
     if change == 0 or one.motion.periods != periods or new.motion.periods != periods:
         return False
@@ -349,8 +353,8 @@ def _is_on_the_way(one: MotionRow, last: MotionRow, new: MotionRow) -> bool:
 def _symmetric_beside(
     line: ForcedLine, value: float, start: np.ndarray, like: PeriodicMotion
 ) -> MotionRow | None:
-    """A symmetric motion with about that start, or near one that is like it, beside a value: where
-    asymmetric ones leave it the equations are singular."""
+    """A symmetric motion beside a value, from the start of `like` or from `start`: at the value,
+    where asymmetric motions leave it, the equations are singular."""
     for size, side in itertools.product(LEAVES, (1.0, -1.0)):
         there = value + side * size * line.length
         if line.first <= there <= line.last:
@@ -365,8 +369,8 @@ def _symmetric_beside(
 
 
 def _apart(line: ForcedLine, condition: AbstractCondition, row: MotionRow) -> np.ndarray | None:
-    """How far the states at the phase 0 are from those half of the periods later, or from those of
-    the image, [states, 2]; None where the motion has not left another one in such a point."""
+    """Differences of the states at the phase 0 from those half of the periods later, or from those
+    of the image, [states, 2]; None if the motion cannot have left another one in such a point."""
     half, odd = divmod(row.motion.periods, 2)
     if isinstance(condition, PeriodDoubling):
         starts = np.asarray(row.motion.starts)
@@ -380,11 +384,12 @@ def _apart(line: ForcedLine, condition: AbstractCondition, row: MotionRow) -> np
 def _past_corner(
     line: ForcedLine, rows: list[MotionRow], value: float, start: np.ndarray
 ) -> MotionRow | None:
-    """The motion at a value near to a state at the phase 0, if it is as near to that as the last
-    row, has nearly its multipliers, and is none that the branch has passed.
+    """The motion at a value with about the state `start` at the phase 0, if the branch may go on
+    with it: it is as near to `start` as the last row, has nearly the same multipliers, and is not
+    on the branch yet.
 
-    Its events may be others: where a mass comes to a contact edge with the velocity of a belt, or
-    two belts have one velocity, they change, and the branch goes on.
+    Its events may differ: they change where a mass comes to a contact edge with the velocity of a
+    belt, or two belts have one velocity.
     """
     if not line.first <= value <= line.last:
         return None
@@ -403,7 +408,7 @@ def _past_corner(
 
 
 def _borders(line: ForcedLine, row: MotionRow) -> list[BifurcationPoint]:
-    """Points near to a motion in which its signature may end."""
+    """Points near a motion at which its signature may end."""
     borders = borders_of(line.at(row.value))
     return [point for one in borders for point in _points(line, one, row)]
 
@@ -415,8 +420,8 @@ def _border(
     value: float,
     start: np.ndarray,
 ) -> BifurcationPoint | None:
-    """The one of these points in which the signature of the last motion ends on the way to another
-    value, and to another state at the phase 0, None where none is so near."""
+    """The nearest of the points `borders` on the way from the last motion to the value and the
+    state `start` at the phase 0; its signature ends there. None if no point is on the way."""
     near = [p for p in borders if _is_between(line, p, last, value, start)]
     change = value - last.value
     ahead = [p for p in near if (float(p.value) - last.value) * change >= -1e-9 * line.length]
@@ -426,20 +431,20 @@ def _border(
 def _through_point(
     line: ForcedLine, rows: list[MotionRow], point: BifurcationPoint, direction: float
 ) -> tuple[list[BifurcationPoint], tuple[MotionRow, float] | None]:
-    """The points behind the last row, up to the one in which its signature ends, and how the branch
+    """The points from the last row up to `point`, in which its signature ends, and how the branch
     goes on from there, see `_beyond_point`."""
     last, end = rows[-1], MotionRow(float(point.value), point.cycle)
     beyond, further = [], None
     if _breaks_symmetry(line, point) and not is_symmetric(line.at(last.value), last.motion):
         return [*_points_between(line, last, end), point], None
     if isinstance(point.condition, GrazingEdge):
-        # Those that go beyond the edge lie off by the root of the distance.
+        # Motions that pass the edge differ from the touching one by the root of the distance.
         beyond = point.condition.with_clock().motions_beyond(line.variation, point)
     for one in beyond:
         row = MotionRow(float(one.value), one.cycle)
         osc = line.at(row.value)
         if is_same_motion(last.motion.at(osc), row.motion):
-            # Its multiplier grows beyond all bounds; the motion that only touches has another one.
+            # Here the multiplier grows beyond all bounds; the motion that touches has another one.
             end = row
         elif further is None and not _has_passed(rows, row.value, osc, row.motion):
             sense = float(np.sign(row.value - float(point.value)))
@@ -452,9 +457,10 @@ def _through_point(
 def _beyond_point(
     line: ForcedLine, rows: list[MotionRow], point: BifurcationPoint, direction: float
 ) -> tuple[MotionRow, float] | None:
-    """A motion beyond the point in which the signature of the last row ended, which is on no part
-    of the branch so far, and the sense in which to go on; direction: the sign is that in which the
-    parameter went."""
+    """A motion beyond the point in which the signature of the last row ended, and the sense in
+    which the parameter goes from it; None if no new one is found.
+
+    direction: its sign is the sense in which the parameter went up to the point."""
     if _jumps_at(point):
         return None
     last = rows[-1]
@@ -488,8 +494,8 @@ def _beyond_point(
 def _has_passed(
     rows: list[MotionRow], value: float, osc: OwnOscillator, motion: PeriodicMotion
 ) -> bool:
-    """Whether a motion at a value is one of the branch so far: of its last row, or of those beside
-    a place where it has passed the value."""
+    """Whether a motion at a value is on the branch so far: equal to its last row, or a row beside
+    a place where the branch has passed the value."""
     pairs = itertools.pairwise(rows)
     beside = [pair for pair in pairs if (pair[0].value - value) * (pair[1].value - value) <= 0]
     near = [rows[-1], *(row for pair in beside for row in pair)]
@@ -497,16 +503,16 @@ def _has_passed(
 
 
 def _jumps_at(point: BifurcationPoint) -> bool:
-    """Whether friction jumps there so that to one side of the point the belt holds, or lets go, for
-    a time that is not short. So the branch ends."""
+    """Whether a branch ends at a point because friction jumps: to one side of the point the belt
+    holds, or lets go, for a time that is not short."""
     condition = point.condition
     may_jump = isinstance(condition, AddingSliding | GrazingSliding | SwitchingSliding)
     return may_jump and friction_jumps(point.oscillator, int(condition.belt))
 
 
 def _other_branches(line: ForcedLine, point: BifurcationPoint, begun: MotionRow) -> list[MotionRow]:
-    """A motion each of the other branches that meet the branch of a motion in a point: of those
-    that leave there, or of the one that goes on where the motion has left it."""
+    """One motion of each other branch that meets the branch of `begun` in a point: of those that
+    leave it there, or of the one that it has left there."""
     value, cycle = float(point.value), point.cycle
     if isinstance(point.condition, PeriodDoubling):
         goes_on = cycle.periods < begun.motion.periods
@@ -524,8 +530,8 @@ def _other_branches(line: ForcedLine, point: BifurcationPoint, begun: MotionRow)
 
 
 def _breaks_symmetry(line: ForcedLine, point: BifurcationPoint) -> bool:
-    """Whether asymmetric motions leave a symmetric one in a point: also where it touches edges on
-    both sides."""
+    """Whether asymmetric motions leave a symmetric one in a point; they do so also where it touches
+    edges on both sides."""
     if isinstance(point.condition, SymmetryBreaking):
         return True
     touches = line.is_symmetric and isinstance(point.condition, GrazingEdge)
@@ -541,7 +547,7 @@ def _asymmetric_beyond(line: ForcedLine, point: BifurcationPoint) -> Iterator[Mo
 
 
 def _begins(line: ForcedLine, row: MotionRow) -> bool:
-    """Whether a branch can begin with a motion: too near to some points equations are singular."""
+    """Whether a branch can begin with a motion: near some points its equations are singular."""
     return _is_motion(row) and bool(MotionLeg.begun(line, row)[1].found)
 
 
@@ -556,8 +562,8 @@ def _is_motion(row: MotionRow) -> bool:
 
 
 def _leaving(line: ForcedLine, point: BifurcationPoint) -> Iterator[MotionRow]:
-    """Motions that leave another one, beside the point: of twice the period in a period doubling,
-    else asymmetric ones."""
+    """Motions beside a point that leave the motion of the point: at a period doubling of twice its
+    period, else asymmetric ones."""
     value, doubles = float(point.value), isinstance(point.condition, PeriodDoubling)
     periods = point.cycle.periods * (2 if doubles else 1)
     for share, size, side in itertools.product(SOME_PHASES, LEAVES, (1.0, -1.0)):

@@ -2,8 +2,8 @@
 
 A cell is a point of a plane of two parameters. Its equilibria are known in closed form. Its cycles
 are those that runs lead to, from the starts from which `scan` follows orbits: ends of stick phases,
-which every cycle that sticks passes, and several distances from an equilibrium. So a cell finds
-what a path through it finds.
+which every cycle that sticks passes, and several distances from an equilibrium. So the same cycles
+are found in a cell as on a path through it.
 """
 
 import re
@@ -34,13 +34,13 @@ from .labels import Label
 SAME_VELOCITY = 1e-12
 #: Tolerance of the runs.
 RUN_TOLERANCE = 1e-8
-#: Letters for equilibria in names.
+#: Letters of equilibria in the names of regions.
 LETTERS = {
     EquilibriumKind.FIXED_POINT: "f",
     EquilibriumKind.PSEUDO_FOCUS: "p",
     EquilibriumKind.SEGMENT: "h",
 }
-#: The letter of a cycle without sticking.
+#: The letter of a cycle that never sticks.
 NEVER_STICKS = "s"
 
 
@@ -52,8 +52,8 @@ def region_name(osc: Oscillator, label: Label) -> str:
 
     A digit: 1 there is a stable equilibrium only; 2 a stable cycle, too; 3 a stable cycle only.
     Where belts run in opposite directions these are 6, 5 and 4. With several belts a letter for
-    each cycle shows what it sticks to: a belt 0, b belt 1, c both (belts as binary digits, for more
-    of them; from the number 19 on, which would be s, the belts in square brackets), s none.
+    each cycle shows what it sticks to: a belt 0, b belt 1, c both, s none. With more belts the
+    letter's number has the belts as binary digits; from s (19) on, belts are in square brackets.
 
     With contact edges there may be several equilibria, of several kinds. There the digit is 1, 2 or
     3 in whatever directions belts run, and after a colon the equilibria follow from left to right:
@@ -80,7 +80,7 @@ def _letter_of(stuck: Collection[int]) -> str:
 
 
 def belts_of_letters(letters: str) -> list[list[int]]:
-    """For each cycle of a region's name the belts to which it sticks."""
+    """The belts to which each cycle in the name of a region sticks."""
     found = []
     for letter in re.findall(r"\[[\d,]+\]|[a-z]", letters):
         if letter.startswith("["):
@@ -98,7 +98,7 @@ def _name(
     equilibria: Sequence[tuple[int, bool]],
     cycles: Sequence[Collection[int]],
 ) -> str:
-    """Like `region_name`, from data; "" where nothing attracts.
+    """Like `region_name`, from the properties that it depends on; "" where nothing attracts.
 
     edged: whether there are contact edges; opposite: whether belts run in opposite directions;
     belts: their number; equilibria: (kind, stable), from left to right; cycles: the belts to which
@@ -138,11 +138,10 @@ def in_plane_of_paper(oscillators: Sequence[Oscillator]) -> bool:
 class Cells(NamedTuple):
     """The motions in each cell, arrays [cells].
 
-    names: of the regions, "" where runs were undecided, or nothing attracts. motions: a number for
-    everything: kind, stability and contacts of each equilibrium, the events of each cycle and the
-    belts that it sticks to; equal where all that is equal, -1 where runs were undecided. on_line:
-    whether a belt is at rest or without load there, or two belts have one velocity, and this is not
-    so in all cells.
+    names: of the regions, "" where runs were undecided or nothing attracts. motions: numbers, equal
+    in cells where kind, stability and contacts of all equilibria, and events and stuck belts of all
+    cycles, agree; -1 where runs were undecided. on_line: whether a belt is at rest or without
+    load, or two belts have one velocity, unless this is so in all cells.
     """
 
     names: np.ndarray
@@ -188,7 +187,7 @@ def made_at(make: Callable[..., Oscillator], names: Sequence[str], point: Any) -
 
 
 def _on_line(still: "_Still") -> np.ndarray:
-    """Where a belt is at rest or without load, or two have one velocity, unless in all cells."""
+    """Mask of cells where a belt is at rest or idle, or two have one velocity, if not in all."""
     # A belt at rest has the velocity of the frame, which counts as one more belt.
     velocities = np.asarray(still.velocities)
     count, n = velocities.shape
@@ -200,7 +199,7 @@ def _on_line(still: "_Still") -> np.ndarray:
 
 
 class _Still(NamedTuple):
-    """What is known of the cells before any run.
+    """What is computed for the cells before any run.
 
     kind, stable: of the equilibria, [cells, equilibria]; modes: [.., belts]; velocities, and which
     belts are idle, without load: [cells, belts]; starts: of `scan`, [cells, starts, 2]; leaves: of
@@ -233,10 +232,10 @@ def _still_at(make, names, points: Array) -> _Still:
 
 
 def _cycles_at(make, names, points, still: _Still, more: np.ndarray):
-    """Which cells are decided, [cells], and the cycles in them.
+    """Mask of the decided cells, [cells], and the sorts of the cycles in them.
 
-    The latter are the numbers of the sorts of cycles, in order, -1 where there are no more, [cells,
-    cycles], and the belts to which each sort sticks.
+    The sorts are numbers, ascending, padded with -1, [cells, cycles]; the last result is the list
+    of the belts to which each sort sticks.
     """
     belts = still.velocities.shape[1]
     results, ran = _runs_from(make, names, points, still, more)
@@ -266,7 +265,7 @@ def _cycles_at(make, names, points, still: _Still, more: np.ndarray):
 
 
 def _runs_from(make, names, points, still: _Still, more: np.ndarray):
-    """Results of the observer of attractors, by name, [cells, starts, ..], and which runs exist."""
+    """Results of the observer `Attractor`, by name, [cells, starts, ..], and a mask of the runs."""
     grid = Grid(make, {name: points[:1, i] for i, name in enumerate(names)}, (0.0, 0.0))
     begun = np.broadcast_to(more, (len(points), *more.shape))
     begun = np.concatenate([still.starts, begun], axis=1)

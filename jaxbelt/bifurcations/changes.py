@@ -16,23 +16,23 @@ from .special import FAR, SpecialPoint, is_elsewhere
 from .systems import RestSystem, Seen
 from .tracks import Track
 
-#: How far from a change of signature the curve is searched for, in steps: it may bend sharply, or
-#: end near there.
+#: Distances from a change of signature, in steps, at which the curve beyond it is searched for: it
+#: may bend sharply, or end near there.
 BESIDE_CHANGE = (0.5, 0.1, 0.02)
-#: What is no farther from the chords between rows is on the curve, in steps: neighbouring tangents
-#: differ by 18 degrees at most.
+#: A point is on a curve if it is no farther than this from the chords between rows, in steps:
+#: neighbouring tangents differ by 18 degrees at most.
 ON_CHORD = 0.05
-#: Where no step is short enough, a point of codimension two this near is in the way, in steps.
+#: A point of codimension two this near, in steps, is why no step along a curve is short enough.
 JUST_AHEAD = 0.02
 #: How often the step in which the motion ceases to exist is halved to find where; for a state of
 #: rest, which costs no integration, to rounding.
 HALVINGS_TO_END, HALVINGS_TO_END_OF_REST = 10, 50
-#: How well a point is found again, with other arcs.
+#: Largest distance of a point from the same one found with other arcs.
 SAME_POINT_AGAIN = 1e-8
 
 
 class CurveProblem(NamedTuple):
-    """What is followed: condition, among oscillators of a variation; within limits, [2, 2]."""
+    """A curve to follow: a condition, in the oscillators of a variation, within limits, [2, 2]."""
 
     condition: AbstractCondition
     variation: Variation
@@ -41,7 +41,7 @@ class CurveProblem(NamedTuple):
     max_points: int
 
     def contains(self, point: SpecialPoint) -> bool:
-        """Whether a point is in the span, up to rounding."""
+        """Whether a point is within the limits, up to rounding."""
         slack = 1e-12 * np.ptp(self.limits, axis=1)
         low, high = self.limits.T
         return bool(np.all((low - slack <= point.values) & (point.values <= high + slack)))
@@ -58,8 +58,8 @@ class CurveRow(NamedTuple):
 
 
 def where_it_ends(track: Track, last: CurvePoint, beyond: CurvePoint) -> tuple[np.ndarray, float]:
-    """The unknowns where the motion just exists, between the last point and one beyond, where its
-    equations may have turned back; and how far from there it does not."""
+    """The unknowns where the motion just exists, between `last` and a point beyond, at which the
+    equations may have turned back; and the distance from there at which it exists no longer."""
     length, known, ends = float((beyond.u - last.u) @ last.tangent), 0.0, 1.0
     of_rest = isinstance(track.system, RestSystem)
     for _ in range(HALVINGS_TO_END_OF_REST if of_rest else HALVINGS_TO_END):
@@ -71,7 +71,7 @@ def where_it_ends(track: Track, last: CurvePoint, beyond: CurvePoint) -> tuple[n
 
 
 def parameters_apart(values: Sequence[float] | np.ndarray, u: np.ndarray) -> float:
-    """How far both parameters are from those of the unknowns u of a curve."""
+    """Distance of both parameters from those in the unknowns u of a curve."""
     return float(np.hypot(*np.subtract(values, u[-2:])))
 
 
@@ -103,10 +103,10 @@ def beyond_change(
     last: np.ndarray,
     centre: np.ndarray,
 ) -> tuple[BifurcationPoint, np.ndarray] | None:
-    """The point of the same condition just beyond a change of signature, and where, or None.
+    """The point of the same condition just beyond a change of signature, and both its parameters.
 
-    It has to be the same cycle, at about the same place. The curve may have a corner there, so the
-    search goes all around the change, except where the curve came from.
+    None if there is none. It has to be the same cycle, at about the same place. The curve may have
+    a corner at the change, so the search goes all around it, except where the curve came from.
     """
     found = (
         _near_change(problem, track, rows, last, centre, part * problem.step)
@@ -133,8 +133,8 @@ def _near_change(
             yield condition.named_point_beside(held, near + offset * reach, *known)
 
     def searched(held: Variation, near: float) -> Iterator[BifurcationPoint | None]:
-        # Where the motion is there only just beside the curve, guesses miss it; those of a state of
-        # rest are all there are.
+        # Where the motion exists only close to the curve, the direct guesses miss it. For a state
+        # of rest there are no other guesses.
         if not has_clock(known[0]) and not isinstance(track.system, RestSystem):
             yield from points_within(condition, held, near, 2 * reach)
 
@@ -168,7 +168,7 @@ def _near_change(
 def is_on_rows(
     at: np.ndarray, place: np.ndarray, values: np.ndarray, places: np.ndarray, near: float
 ) -> bool:
-    """Whether a point is nearer than that to a curve, and its motion about the same as there.
+    """Whether a point is nearer than `near` to a curve, and its motion about the same as there.
 
     at, place: of the point, [2] and [5]; values, places: of the rows of the curve, [rows, ..].
     """
@@ -180,8 +180,8 @@ def is_on_rows(
 
 
 def from_chords(at: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance of a point from each chord of a path, and the part of the chord where it is,
-    [chords]."""
+    """Distance of a point from each chord of a path, and the nearest place on the chord as a part
+    of it, [chords]."""
     a, chord = path[:-1], np.diff(path, axis=0)
     along = np.sum((at - a) * chord, axis=1) / np.maximum(np.sum(chord**2, axis=1), 1e-300)
     along = np.clip(along, 0, 1)
@@ -189,7 +189,7 @@ def from_chords(at: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def named_once(points: Iterable[SpecialPoint]) -> list[SpecialPoint]:
-    """The points without those that are there already, as where a curve begins at its end."""
+    """The points without repetitions, which occur where a curve begins at its end."""
     found: list[SpecialPoint] = []
     for one in points:
         alike = [x for x in found if (x.kind, x.belts) == (one.kind, one.belts)]

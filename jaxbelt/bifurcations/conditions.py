@@ -25,7 +25,7 @@ from ..model.oscillator import Oscillator
 from ..numerics.compiling import jit
 from ..results import Status
 from .base import AbstractCondition, point_of
-from .base import Line as Line  # a user's condition has one
+from .base import Line as Line  # for users' own conditions
 from .guesses import nearest
 from .systems import CycleSystem, Tests, solve_system
 
@@ -33,7 +33,7 @@ from .systems import CycleSystem, Tests, solve_system
 class AbstractCycleCondition(AbstractCondition):
     """A condition on a cycle. Its guess is a loop near the cycle, and a status."""
 
-    #: Arcs that `system` may add to a loop.
+    #: Number of arcs that `system` may add to a loop.
     more_arcs: ClassVar[int] = 0
 
     @abc.abstractmethod
@@ -44,7 +44,7 @@ class AbstractCycleCondition(AbstractCondition):
     def system(
         self, osc: Oscillator, loop: Loop, status: Array
     ) -> tuple[CycleSystem, Array, Array]:
-        """The system of the cycle near a loop, its unknowns there, and a status; compiled."""
+        """The system of the cycle near a loop, its unknowns there, and a status; it is compiled."""
 
     def prepared(self, osc, guess):
         return _prepared(self, osc, *guess)
@@ -63,7 +63,7 @@ class AbstractCycleCondition(AbstractCondition):
         loop = chain.loop(point.cycle.unknowns)
         ok, data = jnp.asarray(Status.OK.value), self.sought.as_data()
         system, x, _ = _prepared(data, point.oscillator, loop, ok)
-        # With the integration steps with which the point was found.
+        # The integration steps are those with which the point was found.
         return eqx.tree_at(lambda system: system.chain.mesh, system, chain.mesh), x
 
 
@@ -88,7 +88,7 @@ def _solved_point(family: Family, system: CycleSystem, z0, p0, status):
 class AbstractStickCondition(AbstractCycleCondition):
     """A condition on how a cycle begins, or ends, to stick to a belt.
 
-    If two belts have one velocity and touch the mass at the same times, it may be either of them.
+    If two belts have one velocity and equal contacts all along, a point of one is one of the other.
     """
 
     belt: int | Array
@@ -106,7 +106,7 @@ class AbstractStickCondition(AbstractCycleCondition):
 
 @jit
 def _touch_alike(chain: Chain, pair: Array) -> Array:
-    """Whether both belts touch, or none, all along, so that the same happens to both."""
+    """Whether two belts have equal contacts in all arcs, so that the same happens to both."""
     one, other = chain.codes[:, pair].T
     return jnp.all((one == other) | ~chain.used)
 

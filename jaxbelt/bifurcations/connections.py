@@ -2,20 +2,20 @@
 
 At (sigma, 0) of an edge from which both sides push away two orbits begin and two end, in finite
 time: its unstable and its stable separatrices, see `cycles.separatrices`. Where an orbit that
-begins at a saddle ends at a saddle, the basins beside them change. An orbit back to the same saddle
+begins at a saddle ends at a saddle, the basins beside it change. An orbit back to the same saddle
 is a cycle of finite period that passes a point where orbits part: an unstable or an attracting
 cycle is born or vanishes there.
 
 The orbit from the saddle is an open chain of arcs. It has as many equations as a cycle with these
-arcs, see `cycles.shooting`: that it begins at the saddle replaces that it closes, and that it ends
-at a saddle is the additional equation. On one side of the point the orbit turns just before the
-edge, on the other side it passes the edge; the last arc is made to end where x2 = 0, so the
-equation, x1 = sigma there, is linear in the unknowns.
+arcs, see `cycles.shooting`: the two equations of closing are replaced by those of beginning at the
+saddle, and one more says that the orbit ends at a saddle. On one side of the point it turns just
+before the edge, on the other side it passes the edge; the last arc is made to end where x2 = 0, so
+that the additional equation, x1 = sigma there, is linear in the unknowns.
 
 Between two values the orbits from the saddles are compared by their courses: between which saddles
 each of their extrema of x1 lies, one after the other. These change where an extremum lies on a
 saddle, and nowhere else, for an orbit depends continuously on the parameter until it comes to a
-saddle. It does not where the static limit of a belt exceeds mu(0), or a belt is at rest; courses
+saddle. This fails where the static limit of a belt exceeds mu(0), or a belt is at rest; courses
 are not compared there.
 
 Connections of two-folds are described by M. Guardia, T. Seara, M. Teixeira, Generic bifurcations of
@@ -63,18 +63,18 @@ from .systems import (
     velocity_tests,
 )
 
-#: Arcs for which the orbits from saddles are followed: some ten loops.
+#: Number of arcs for which the orbits from saddles are followed: some ten loops.
 ARCS = SIZES[2] - 1
 #: States along each arc of a connection that is drawn.
 CONNECTION_SAMPLES = 33
-#: Extrema of x1 in a course. There may be five arcs between two of them.
+#: Number of extrema of x1 in a course. There may be five arcs between two of them.
 EXTREMA = 12
 
 
 class Connection(CycleSystem):
     """An orbit from the saddle of one edge to that of another.
 
-    leaves, arrives: numbers of the edges, see `modes.edges`. The last row of the chain is not used:
+    leaves, arrives: numbers of the edges, see `modes.edges`. The last row of the chain is no arc:
     its state is the end of the orbit.
     """
 
@@ -86,7 +86,7 @@ class Connection(CycleSystem):
         return z[-1, 0] - edge_at(osc, self.arrives)
 
     def _beginning(self, osc: Oscillator, entry: Array) -> Array:
-        """Difference of its first state from its saddle, [2]."""
+        """Difference of the first state of the orbit from the saddle that it leaves, [2]."""
         return entry - jnp.stack([edge_at(osc, self.leaves), jnp.zeros(())])
 
     def residual(self, osc, x):
@@ -94,7 +94,7 @@ class Connection(CycleSystem):
         return closed.at[self._closing(x)].set(self._beginning(osc, x[0, :2]))
 
     def _closing(self, x: Array) -> slice:
-        """The two equations of a closed chain that say that it closes."""
+        """Rows of the two equations by which a chain closes."""
         return slice(x.size - 3, x.size - 1)
 
     def linearized(self, osc_of, x, p):
@@ -110,17 +110,17 @@ class Connection(CycleSystem):
         return value.at[rows].set(begins(u)), matrix.at[rows].set(row)
 
     def exists(self, osc: Oscillator, x: Array) -> Array:
-        """Whether the oscillator moves along it, from a saddle to a saddle."""
+        """Whether the orbit is admissible, and both of its ends are saddles."""
         ends = jnp.stack([self.leaves, self.arrives])
         return admissible(osc, self.chain, x) & jnp.all(saddles(osc)[ends])
 
     def closes(self, osc: Oscillator) -> Array:
-        """Whether it comes back to its saddle."""
+        """Whether the orbit comes back to the saddle that it leaves."""
         positions = jnp.stack(edges(osc))
         return positions[self.leaves] == positions[self.arrives]
 
     def place(self, osc, x):
-        # The state at its end, too.
+        # The state at the end of the orbit counts, too.
         used = np.asarray(self.chain.used)
         return extent(np.concatenate([x[used], x[-1:]]))
 
@@ -194,7 +194,7 @@ class SaddleConnection(AbstractCondition):
             check_edge(osc, self.to, "to")
 
     def as_data(self):
-        # One program serves all.
+        # One program serves all belts; -1 stands for None.
         to = -1 if self.to is None else self.to
         return SaddleConnection(*(jnp.asarray(np.array(one)) for one in (self.belt, to)))
 
@@ -204,7 +204,7 @@ class SaddleConnection(AbstractCondition):
 
     def guess(self, osc, size):
         loop, *rest = _nearest_connection(osc, self.belt, self.to, size)
-        # In as few rows as it needs, where that is known; one more stands for its end.
+        # As few rows as the orbit needs, if their number is known; one more holds its end.
         return cut([loop], more=1)[0] if is_concrete(loop) else loop, *rest
 
     def prepared(self, osc, guess):
@@ -231,7 +231,7 @@ class SaddleConnection(AbstractCondition):
         return states[np.asarray(system.chain.used)].reshape(-1, 2)
 
     def limit(self, trail):
-        """The Hopf point on the edge to which it has shrunk together with its saddle."""
+        """The Hopf point on the edge to which the connection, with its saddle, has shrunk."""
         if trail.end is Stop.POINT_COUNT:
             return None
         return hopf_limit("BoundaryHopf", trail, _from_edge, trail.system.leaves)
@@ -265,7 +265,7 @@ def _solved_connection(family: Family, system: Connection, z0, p0, status):
 
 @jit
 def _solved_at(osc: Oscillator, system: Connection, x: Array) -> Array:
-    """Unknowns of the orbit from its saddle, up to the point that will be an extremum."""
+    """Unknowns of the orbit that leaves the saddle, at a fixed parameter, up to where x2 = 0."""
 
     def linearized(x):
         value, matrix = system.linearized(lambda _: osc, x.reshape(-1, 3), jnp.zeros(1))
@@ -290,7 +290,7 @@ def _states_on(osc: Oscillator, system: Connection, x: Array) -> Array:
 
 
 def _departing(osc: Oscillator, edge: Array, rightward: Array, parts: Array, budget: int) -> Orbit:
-    """The orbit that leaves the saddle of an edge to one side; parts: whether there is one."""
+    """The orbit that leaves the saddle of an edge to one side; parts: whether it is a saddle."""
     x1 = jnp.where(parts, edge_at(osc, edge), 0.0)
     status = jnp.where(parts, Status.OK.value, Status.NOT_FINITE.value)
     y = jnp.stack([x1, jnp.zeros(())])
@@ -298,7 +298,7 @@ def _departing(osc: Oscillator, edge: Array, rightward: Array, parts: Array, bud
 
 
 def _turns_back(osc: Oscillator, orbit: Orbit) -> Array:
-    """Whether each arc ends in an extremum of x1, [arcs]; the boundary of a belt at rest is one."""
+    """Mask [arcs] of those that end in an extremum of x1, or on the boundary of a belt at rest."""
     n, velocities = len(osc.belts), jnp.stack([belt.velocity for belt in osc.belts])
     meets_rest = (orbit.ends < n) & (velocities[jnp.clip(orbit.ends, 0, n - 1)] == 0)
     return (orbit.ends == Ends(n).extremum_x1) | meets_rest
@@ -308,8 +308,8 @@ def _turns_back(osc: Oscillator, orbit: Orbit) -> Array:
 def _nearest_connection(osc: Oscillator, belt: Array, to: Array, size: int):
     """The orbit from the saddles of a belt that comes nearest to a saddle.
 
-    Returns it as a loop, up to there, the numbers of both edges, and a status. to: the belt of the
-    saddle at its end; -1: any.
+    Returns the orbit up to there as a loop, the numbers of both edges, and a status. to: the belt
+    of the saddle at the end; -1: any.
     """
     osc = lax.stop_gradient(osc)
     n, names, parts = len(osc.belts), Ends(len(osc.belts)), saddles(osc)
@@ -325,7 +325,7 @@ def _nearest_connection(osc: Oscillator, belt: Array, to: Array, size: int):
         exits = orbit.exits
         turns = jnp.where(_turns_back(osc, orbit), 0.0, jnp.inf)
         turned = jnp.abs(exits[:, :1] - positions[None]) + turns[:, None]
-        # Distance that an orbit which passes a saddle would have gone farther in its mode.
+        # An orbit that passes an edge: how much farther it would have gone, in its mode, to x2 = 0.
         on_edge = (orbit.ends >= n) & (orbit.ends < 3 * n)
         at = positions[jnp.clip(orbit.ends - n, 0, 2 * n - 1)]
         push = jax.vmap(
@@ -359,16 +359,16 @@ def _nearest_connection(osc: Oscillator, belt: Array, to: Array, size: int):
 
 # --- courses --------------------------------------------------------------------------------------
 
-#: For each of the first `EXTREMA` extrema of x1, between which saddles it lies.
+#: For each of the first `EXTREMA` extrema of x1, the number of saddles to the left of it.
 SaddleCourse = tuple[int, ...]
 
 
 class _Courses(eqx.Module):
-    """Courses for each edge and each side, [edges, sides].
+    """What courses are made of, for each edge and each side, [edges, sides].
 
-    leaves: whether an orbit leaves a saddle there; extrema: x1 at the ends of arcs that are extrema
-    of it, else NaN, [edges, sides, arcs]; repeats: the row after which it repeats, or -1; rest: x1
-    where the orbit ended at rest, else NaN.
+    positions: of the edges, [edges]; leaves: mask of those with a saddle whose orbits are compared,
+    [edges]; extrema: x1 at the ends of arcs that are extrema of x1, else NaN, [edges, sides, arcs];
+    repeats: the row after which the orbit repeats, or -1; rest: x1 where it ended at rest, or NaN.
     """
 
     positions: Array
@@ -409,7 +409,7 @@ def _courses_of(oscs: Oscillator) -> _Courses:
 def courses_of(oscs: Oscillator) -> list[tuple[SaddleCourse, ...]]:
     """Courses of the orbits that leave saddles, for each oscillator of a batch.
 
-    From left to right, that to the left first.
+    Saddles are in order from left to right; of each, the orbit to the left comes first.
     """
     if not np.any(_all_saddles(oscs)):
         return [()] * len(oscs.damping)
@@ -431,7 +431,7 @@ def _courses_at(seen: _Courses) -> tuple[SaddleCourse, ...]:
 
 
 def _course(at: Any, extrema: Any, repeats: Any, rest: Any) -> SaddleCourse:
-    """A course between saddles at these x1."""
+    """The course of an orbit between saddles at the places `at`."""
     known = ~np.isnan(extrema)
     letters = np.searchsorted(at, extrema[known]).tolist()
     if not np.isnan(rest):

@@ -63,10 +63,10 @@ class StickLimit(CycleSystem):
 
 
 def arrival_tests(osc: Oscillator, chain: Chain, z: Array, row: Array, own: bool | Array = False):
-    """Functions to watch for a cycle with a coincidence at the end of the arc `row`.
+    """Functions to watch for a cycle with two events at once at the end of the arc `row`.
 
-    A stick phase that begins or ends there may have no duration. own: boundaries that are part of
-    the coincidence, by the arcs at whose ends they lie, [arcs, belts].
+    A stick phase that begins or ends there may have no duration. own: mask of the boundaries that
+    are part of the coincidence, at the ends of arcs, [arcs, belts].
     """
     others = chain.used & ~stick_phase_from(osc, chain, (row + 1) % jnp.sum(chain.used))
     here = jnp.arange(others.size) == row
@@ -79,10 +79,10 @@ class CrossingSliding(AbstractStickCondition):
     """The cycle crosses the boundary of a belt and begins to stick to it at the crossing.
 
     It arrives at one end of the stretch where the mass sticks. At the end of slip onset a stick
-    phase begins with no duration (crossing). From the other end the mass sticks all the way;
-    before, the cycle crosses the boundary, comes back soon and sticks then (buckling). Where the
-    static limit exceeds mu(0), the orbit goes far beyond the boundary at once, and may not come
-    back (jump).
+    phase begins with no duration (crossing). From the other end the mass sticks all the way; on the
+    other side of the point the cycle crosses the boundary, comes back soon and sticks then
+    (buckling). Where the static limit exceeds mu(0), the orbit goes far beyond the boundary at
+    once, and may not come back (jump).
 
     Args:
         belt: Number of the belt.
@@ -102,7 +102,7 @@ class CrossingSliding(AbstractStickCondition):
         return nearest(osc, size, self)
 
     def distance(self, osc: Oscillator, loop: Loop) -> Array:
-        """Distance of a loop's arrival from such an end."""
+        """Distance of the loop's nearest arrival from an end of a stretch where the mass sticks."""
         return arrival_near_limit(osc, loop, self.belt).distance
 
     def system(self, osc, loop, status):
@@ -147,9 +147,9 @@ class Arrival(eqx.Module):
 
 
 def arrival_near_limit(osc: Oscillator, loop: Loop, belt: int | Array) -> Arrival:
-    """The arc of a loop that arrives at the boundary of a belt nearest to such an end.
+    """The arc of a loop that arrives at a belt's boundary nearest to an end of where it can stick.
 
-    At the other end the orbit would arrive tangentially, with the other sign of r.
+    That end has the side -sgn(r): at the other one the orbit would arrive tangentially.
     """
     velocities = jnp.stack([one.velocity for one in osc.belts])
     same = velocities == velocities[belt]
@@ -169,8 +169,8 @@ def arrival_near_limit(osc: Oscillator, loop: Loop, belt: int | Array) -> Arriva
 
 @jit
 def _limit_met(cycle: Cycle, belt: int | Array) -> tuple[Array, Array]:
-    """The end of the stretch at which a cycle arrives, see `StickLimit.side`, and whether a law
-    jumps there."""
+    """The side of the stretch at which a cycle arrives, see `StickLimit`, and whether the static
+    limit of a belt that sticks there exceeds mu(0)."""
     osc, loop = cycle.oscillator, cycle.chain.loop(cycle.unknowns)
     near = arrival_near_limit(osc, loop, belt)
     jumps = [(near.codes[i] == 0) & has_jump(one) for i, one in enumerate(osc.belts)]

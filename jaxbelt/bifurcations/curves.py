@@ -2,11 +2,11 @@
 
 A condition's own system of equations, regular at the point, stays regular along its curve. With one
 more unknown, the second parameter, pseudo-arclength continuation follows it (see `continuation`),
-turning points included. The signature is fixed while it lasts. Watched are functions that vanish
-where two conditions hold at once: the velocities of the belts and their differences on every curve,
-and those that the condition's system names. Where one changes its sign the system is solved for its
-zero, a point of codimension two. There the signature may change; the condition is then refined anew
-just beyond, and the curve goes on with the signature that is found.
+turning points included. The signature is fixed while it lasts. Functions that vanish where two
+conditions hold at once are watched: the velocities of the belts and their differences on every
+curve, and those that the condition's system names. Where one changes its sign, the system is solved
+for its zero, a point of codimension two. There the signature may change; the condition is then
+refined anew just beyond, and the curve goes on with the signature that is found.
 """
 
 from collections.abc import Callable
@@ -63,7 +63,7 @@ from .tracks import Track, special_between, special_on
 if TYPE_CHECKING:
     import pandas
 
-#: Steps are shortened to this fraction before a curve ends because none is short enough: a curve of
+#: A curve ends where steps shorter than this fraction of the longest would be needed: a curve of
 #: nonsmooth folds has a turning point with a radius of a hundredth of a step.
 SHORTEST_PART = 1e-3
 #: Number of points after which the integration steps are distributed anew.
@@ -85,7 +85,7 @@ class BifurcationCurve(eqx.Module):
         places: Smallest and largest x1, the same of x2, and the period, of the cycle or the fixed
             point, [rows, 5], NaN where there is none.
         special: Points of codimension two, in order.
-        ends: Why it ends at the first and the last row.
+        ends: Why the curve ends at the first and the last row.
         names: Names of the parameters.
     """
 
@@ -116,7 +116,7 @@ class BifurcationCurve(eqx.Module):
     def table(self, names: tuple[str, str] | None = None) -> "pandas.DataFrame":
         """Returns a row for each row of the curve and each special point, in order.
 
-        Columns: condition, belts (of what holds there), the two parameters, multiplier, residual,
+        Columns: condition, belts (of the condition), the two parameters, multiplier, residual,
         special (kind and belts of a special point, else "").
 
         Args:
@@ -151,7 +151,7 @@ class BifurcationCurve(eqx.Module):
             ends = [np.hypot(*(path[i] - at)) for i in (0, -1)]
             gaps = np.hypot(*(path[1:] - path[:-1]).T)
             detour = np.hypot(*(path[:-1] - at).T) + np.hypot(*(path[1:] - at).T) - gaps
-            # At an end, where that is nearer than the detour between two rows, or a row itself.
+            # Before the first or after the last row, if that row is nearer than the least detour.
             places = [ends[0], *np.maximum(detour, 0), ends[1]]
             place = int(np.argmin(places)) if ends[1] else len(path)
             path = np.insert(path, place, at, axis=0)
@@ -184,7 +184,7 @@ class BifurcationCurve(eqx.Module):
 
 
 def given_curve(curve: BifurcationCurve, variation: Variation) -> BifurcationCurve:
-    """A curve that was found in own units, in the units of the given variation."""
+    """A curve that was found in own units, converted to the units of the given variation."""
     if variation.units is None:
         return curve
     length, units = variation.units.length, variation.units.parameters
@@ -215,8 +215,8 @@ def bifurcation_curve(
         where: Selects the two parameters; or a function of both that returns the oscillator,
             `make(p, q)`.
         span: First and last value of each parameter.
-        at: Values (p, q) near the point; needed only where one oscillator is at several places of
-            the plane (of `p**2`, for example).
+        at: Values (p, q) near the point; needed only where several places of the plane have the
+            same oscillator (as for a function of `p**2`).
         step: Largest distance between neighbours, in units of the parameters in which a change by 1
             changes some number of the dimensionless oscillator by 1, and none by more; up to a
             factor of two, by the unit of length.
@@ -289,7 +289,7 @@ def follow_point(
 ) -> BifurcationCurve:
     """The curve of a point at `start`, [2], within limits, [2, 2].
 
-    step: in units in which both parameters make the same difference.
+    step: in units in which both parameters change the oscillator equally.
     """
     units = np.asarray(variation.family(start).units)
     measured, ends = variation.measured_in(units), limits / units[:, None]
@@ -370,8 +370,8 @@ def _side(
         changes = leg.at_change
         if not points or end is Stop.STEP_TOO_SMALL:
             trail = trail._replace(end=Stop.STEP_TOO_SMALL)
-            # What is watched with forcing does not change the signature; the curve of a multiplier
-            # ends where the signature does.
+            # With forcing, zeros of watched functions do not change the signature; the curve of a
+            # multiplier ends where the signature does.
             changes = [] if is_forced else just_ahead(seen_last, problem.step)
             special += changes
             goes_on = is_forced and not isinstance(problem.condition, UnitCircle) and points
@@ -380,7 +380,7 @@ def _side(
         elif beyond is None and end is not Stop.POINT_COUNT:
             return _ended(problem, rows, special, trail)
         elif beyond is None:
-            # The same curve with a new mesh, or with arcs that end where x2 is extreme.
+            # The same curve goes on with a new mesh, or with arcs that end where x2 is extreme.
             at, seen = points[-1]
             begun = None if seen.is_cut else _begun_again(problem, track, at)
             track, u, direction = begun or track.remeshed(last, at.tangent)
@@ -412,8 +412,8 @@ def _side(
 def _begun_again(
     problem: CurveProblem, track: Track, at: CurvePoint
 ) -> tuple[Track, np.ndarray, np.ndarray] | None:
-    """What follows the same curve from a point with the arcs that the motion has there, u, and the
-    direction; None where the same point is not found."""
+    """The track that follows the same curve with the arcs that the motion has at a point, u there,
+    and the direction; None where the point is not found with these arcs."""
     osc, values, way = problem.variation.oscillator(at.u[-2:]), at.u[-2:], at.tangent[-2:]
     held = int(np.argmax(np.abs(way)))
     along = problem.variation.held(held, float(values[held]))
@@ -457,15 +457,15 @@ def _ended_between(
     step: tuple[tuple[CurvePoint, Seen], CurvePoint],
     u: np.ndarray,
 ) -> _OneSide:
-    """The side of a curve of states of rest, or of forced motions, that ends at u: a row is there.
+    """The side of a curve of states of rest, or of forced motions, that ends at u, with a row at u.
 
-    special: up to its last point, and at u; step: from that point to one where there is no such.
+    special: up to the last point, and at u; step: from that point to one where no motion exists.
     """
     (passed, known), (last, beyond) = special, step
     end = beyond._replace(u=u), track.seen_at(u)
     if beyond.end is Stop.LEFT_SPAN and parameters_apart(u[-2:], beyond.u) < SAME_POINT_AGAIN:
         trail = trail._replace(end=Stop.LEFT_SPAN)
-    # What is watched may vanish at the end without a change of sign.
+    # Watched functions may vanish at the end without a change of sign.
     tests, behind, pair = end[1].tests, track.seen_at(beyond.u).tests, (float(u[-2]), float(u[-1]))
     at_end = {(one.kind, one.belts): one for one in known} | {
         name: SpecialPoint(*name, pair, abs(value))
@@ -487,9 +487,9 @@ def _end_at_rest(problem: CurveProblem, rows: list[CurveRow], near: float) -> Sp
 class _Leg(NamedTuple):
     """A leg of a curve.
 
-    points: with what is seen there, where the motion exists; special: points of codimension two
-    between them; beyond: the next point, where it does not exist; at_change: points of codimension
-    two between that and the last one.
+    points: those where the motion exists, and what is `Seen` there; special: points of codimension
+    two between them; beyond: the next point, where the motion does not exist; at_change: points of
+    codimension two between the last of the points and `beyond`.
     """
 
     points: list[tuple[CurvePoint, Seen]]
@@ -509,8 +509,8 @@ def _leg(
     *,
     is_start: bool,
 ) -> _Leg:
-    """A leg of so many points at most, up to one at which x2 is extreme within an arc; is_start:
-    whether its first point is that at which the curve begins, and no leg has been there."""
+    """A leg of at most `most` points, which ends early where x2 is extreme within an arc; is_start:
+    whether its first point is the start of the curve, and no leg has been there."""
     points, special = [], []
     for at in _points_along(problem, track, u, direction, most):
         if points:
@@ -532,7 +532,7 @@ def _leg(
 
 
 def _closing(track: Track, before: CurvePoint, after: CurvePoint, home: _Home) -> CurvePoint | None:
-    """The point where the curve began, if the step from one point to the next passes it."""
+    """The point where the curve began, if the step from `before` to `after` passes it."""
     chord = (after.u - before.u)[-2:]
     part = (home.values - before.u[-2:]) @ chord / (chord @ chord)
     if not 1e-9 < part <= 1:

@@ -164,10 +164,10 @@ def bifurcation_diagram(
         resolution: As for `scan`, which finds the special points.
         start: For a forced oscillator only, whose diagram is the branch of one periodic motion,
             stable and unstable, with the points on it, and the branches that leave it at period
-            doublings and where symmetry breaks (rows and resolution do not count): that motion, or
+            doublings and where symmetry breaks (rows and resolution play no part): that motion, or
             a start (x1, x2) at t = 0 that leads to it with the parameter in the middle of the span.
-            None: one that is found in the middle of the span, and, where the branches so far do not
-            reach, in the middle of the widest part without one. A branch ends where no motion is
+            None: a motion found in the middle of the span, and others found in the middle of the
+            widest part that no branch reaches. A branch ends where no motion is
             found beyond a point, or where it cannot be followed further or grows beyond all bounds,
             see `open_ends`.
 
@@ -231,7 +231,7 @@ def bifurcation_diagram(
 
 
 def _is_forced(osc: Any, where: Any, span: Any) -> bool:
-    """Whether what is varied knows the time."""
+    """Whether the oscillators that are varied are forced."""
     if isinstance(osc, Oscillator) or not callable(osc):
         return isinstance(osc, Oscillator) and has_clock(osc)
     ends = as_span(osc, where, span)
@@ -242,7 +242,7 @@ def _is_forced(osc: Any, where: Any, span: Any) -> bool:
 
 
 def _made_by(make: Any, value: float) -> Oscillator | None:
-    """The oscillator that a function returns, or None: other checks refuse such a function."""
+    """The oscillator that a function returns; None if it fails, which later checks refuse."""
     try:
         made = make(value)
     except Exception:
@@ -286,7 +286,7 @@ def _forced_diagram(osc: Any, where: Any, span: Any, start: Any) -> BifurcationD
 def _start_of_branch(
     variation: Variation, limits: np.ndarray, start: Any
 ) -> tuple[PeriodicMotion, float]:
-    """The motion to begin from, and where it is."""
+    """The motion from which the branch is followed, and the value of the parameter there."""
     if isinstance(start, PeriodicMotion):
         status = Status(int(start.status))
         require(status == Status.OK, "start", "a motion with status OK", status.name)

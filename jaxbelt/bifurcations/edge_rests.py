@@ -4,7 +4,7 @@ There is no cycle at these points, and no unknown but the parameter.
 
 - `BoundaryEquilibrium`: at rest on an edge, the force on one of its sides is zero, or as large as
   belts at rest there can hold: a fixed point, or the end of a segment, comes to lie on the edge. It
-  continues beyond the point (persistence) if the other side of the edge pushes to it, as a
+  continues beyond the point (persistence) if the other side of the edge pushes towards it, as a
   pseudo-focus, or holds the mass; if that side pushes away, it meets the saddle of the edge and
   both vanish (annihilation). Where the static limit of a belt at rest exceeds mu(0), orbits end
   only in that part of the segment where mu(0) is enough; the end of that part may come to the edge,
@@ -54,13 +54,13 @@ from .rests import NOTHING, AbstractRestOfSeveral, criticality, limit_near
 from .special import SpecialPoint, Trail, extrapolated_to_zero
 from .systems import RestSystem, Tests, small_newton
 
-#: A cycle around a pseudo-focus is as large as a velocity if the range of its x2 is at most so many
-#: times that velocity.
+#: A cycle around a pseudo-focus is as small as a velocity if the range of its x2 is at most this
+#: many times the velocity.
 AS_LARGE = 3.0
 
 
 class _EdgeSystem(RestSystem):
-    """One equation, for the motion at rest on the edge of this number."""
+    """One equation, for a state of rest on the edge of number `edge`."""
 
     edge: eqx.AbstractVar[Array]
 
@@ -69,7 +69,7 @@ class _EdgeSystem(RestSystem):
         raise NotImplementedError
 
     def meets_hopf(self, osc: Oscillator) -> Array:
-        """The expression that vanishes where its curve meets that of a Hopf point, else NaN."""
+        """An expression that vanishes where the curve meets one of Hopf points, else NaN."""
         raise NotImplementedError
 
     def residual(self, osc, x):
@@ -89,9 +89,9 @@ class _EdgeSystem(RestSystem):
 class EdgeRest(_EdgeSystem):
     """The equation of an equilibrium on an edge.
 
-    The force needed at rest on one side of it, less what belts at rest there can hold in one of the
-    two directions (0 where none is at rest). kinetic: whether the latter is their kinetic friction,
-    so that the part of a segment in which orbits end ends there.
+    It is the force needed at rest on one side of the edge, minus what belts at rest there can hold
+    in one of the two directions (0 where none is at rest). kinetic: whether they hold with their
+    kinetic friction, which limits that part of a segment in which orbits end.
     """
 
     edge: Array
@@ -109,7 +109,7 @@ class EdgeRest(_EdgeSystem):
         return select(self.kinetic, kinetic_capacity(osc, mode), capacity(osc, mode))
 
     def meets_hopf(self, osc):
-        # There is none for the end of a segment.
+        # The end of a segment meets no Hopf point.
         at, mode = edge_at(osc, self.edge), mode_of(self.codes)
         trace = field_at_rest(osc, _where_nothing_holds(osc, mode, at), at)[1]
         return jnp.where(capacity(osc, mode) > 0, jnp.nan, trace)
@@ -119,11 +119,11 @@ class EdgeRest(_EdgeSystem):
         return {("DoubleBoundaryEquilibrium", ()): jnp.where(persists, jnp.nan, push)}
 
     def across(self, osc: Oscillator) -> tuple[Array, Array]:
-        """How hard the other side pushes to the edge, and whether the equilibrium persists
+        """Acceleration of the other side towards the edge, and whether the equilibrium persists
         regardless.
 
         It does where belts at rest hold the mass on the other side, and where the end of a segment
-        that comes to the edge first.
+        that lies on the edge is the near one, which comes to the edge first.
         """
         at, rest = edge_at(osc, self.edge), jnp.zeros(())
         sides = _beside_edge(osc, at)
@@ -136,7 +136,7 @@ class EdgeRest(_EdgeSystem):
         return push, stays | other.any_stuck
 
     def exists(self, osc, x):
-        # Whether the contacts on that side are those, and the kinetic limit is a separate one.
+        # The contacts on that side have to be `codes`; a kinetic limit has to be a separate one.
         at, mode = edge_at(osc, self.edge), mode_of(self.codes)
         left, right = _beside_edge(osc, at)
         jumps = capacity(osc, mode) - kinetic_capacity(osc, mode) > force_rounding(at)
@@ -167,7 +167,7 @@ class EdgeBalance(_EdgeSystem):
         return trace_right * a_left - trace_left * a_right
 
     def exists(self, osc, x):
-        # Whether there is a pseudo-focus between these contacts, and no belt at rest brakes.
+        # A pseudo-focus has to exist between these contacts, and no belt at rest may brake.
         same = [
             jnp.all(jnp.stack(here.codes) == jnp.stack(mode.codes))
             for here, mode in zip(
@@ -214,7 +214,7 @@ def pseudo_hopf_limit(trail: Trail) -> SpecialPoint | None:
 
 @jit
 def _degenerate_focus(family: Family, edge: Array, guess: Array) -> tuple[Array, Array]:
-    """Both parameters of such a pseudo-focus, and the error."""
+    """Both parameters of a degenerate pseudo-focus on an edge, and its residual."""
 
     def equations(given, p):
         family, edge = given
@@ -257,9 +257,9 @@ def slow_focus_limit(trail: Trail, belt: int) -> SpecialPoint | None:
 
 @jit
 def _slow_focus(family: Family, system: EdgeBalance, belt: Array, guess: Array):
-    """Both parameters where the belt is at rest and the rate of a pseudo-focus zero, and the error.
+    """Both parameters where a belt is at rest and the rate of a pseudo-focus 0, and the residual.
 
-    Its contacts are those of a belt that moves.
+    The contacts of the pseudo-focus are those beside it while the belt moves.
     """
 
     def equations(given, p):
@@ -279,7 +279,7 @@ def _edges_passed(trail: Trail) -> np.ndarray:
 
 
 class _EdgeCondition(AbstractRestOfSeveral):
-    """A condition on the motion at rest on a contact edge of a belt."""
+    """A condition on a state of rest on a contact edge of a belt."""
 
     belt: int | Array
 
@@ -288,7 +288,7 @@ class _EdgeCondition(AbstractRestOfSeveral):
         check_edge(osc, self.belt)
 
     def _systems_at_edges(self, osc: Oscillator) -> tuple[_EdgeSystem, Array]:
-        """A system for each edge, and whether it can hold at all, a row each."""
+        """Systems for the edges of the belt, a row each, and a mask of those that can hold."""
         raise NotImplementedError
 
     def systems(self, osc):
@@ -305,8 +305,8 @@ class _EdgeCondition(AbstractRestOfSeveral):
 class BoundaryEquilibrium(_EdgeCondition):
     """A fixed point, or the end of a segment, lies on a contact edge of a belt.
 
-    Or the end of that part of a segment in which orbits end, where the static limit of a belt
-    exceeds mu(0).
+    Where the static limit of a belt exceeds mu(0), it may also be the end of that part of a segment
+    in which orbits end.
 
     Args:
         belt: Number of the belt.
@@ -320,7 +320,7 @@ class BoundaryEquilibrium(_EdgeCondition):
 
     @classmethod
     def between(cls, before, after, edged):
-        # What passes an edge changes its kind or its contacts, or a segment attracts no more.
+        # An equilibrium passing an edge changes kind or contacts, or a segment attracts no more.
         there, then = (
             [
                 (kind, stable and kind == EquilibriumKind.SEGMENT, modes)
@@ -344,7 +344,7 @@ class PseudoHopf(_EdgeCondition):
         belt: Number of the belt.
     """
 
-    #: Loops around it neither grow nor shrink, and those of a cycle beside it are lost in rounding.
+    #: Loops around the pseudo-focus keep their size; a cycle near it is lost in rounding.
     slow: ClassVar[bool] = True
 
     caption: ClassVar[str] = "pseudo-Hopf, belt {belt}"
@@ -381,12 +381,12 @@ def _beside_edge(osc: Oscillator, at: Array) -> tuple[Mode, Mode]:
 
 
 def _where_nothing_holds(osc: Oscillator, mode: Mode, at: Array) -> Mode:
-    """The contacts at rest on an edge as a slip mode, where belts at rest hold nothing."""
+    """The contacts at rest on an edge, as a slip mode where belts at rest cannot hold the mass."""
     return settle(osc, mode, at, jnp.zeros_like(at))
 
 
 def _edge_rests(osc: Oscillator, belt: int | Array) -> tuple[EdgeRest, Array]:
-    """Equations of a boundary equilibrium at the edges of a belt, and whether each is distinct."""
+    """Equations of boundary equilibria at the edges of a belt, and a mask of the distinct ones."""
     cases = []
     for edge in _edges_of(osc, belt):
         sides = _beside_edge(osc, edge_at(osc, edge))

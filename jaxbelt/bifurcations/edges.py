@@ -1,11 +1,11 @@
 """Cycles that touch a contact edge: `GrazingEdge` and `CornerCollision`.
 
-An arc of a cycle ends on a contact edge and in a second event at once. If that is an extremum of
-x1, the orbit is tangent to the edge, x2 = 0; if it is a boundary r_k = 0 or slip onset, the orbit
-runs into the corner of that and the edge. On one side of the point the edge ends the arc, on the
-other the second event: the equation is that the guard of the other one vanishes, which is linear in
-the unknowns. If a cycle passes the edge and turns back soon after, that excursion is left out: with
-it the equation is of second order in the velocity at the edge.
+An arc of a cycle ends on a contact edge and in a second event at once. If the second event is an
+extremum of x1, the orbit is tangent to the edge, x2 = 0; if it is a boundary r_k = 0 or slip onset,
+the orbit runs into the corner of both. On one side of the point the edge ends the arc, on the other
+side the second event does. The equation is that the guard of the event that does not end the arc
+vanishes, which is linear in the unknowns. If a cycle passes the edge and turns back soon after,
+that excursion is left out: with it the equation is of second order in the velocity at the edge.
 
 Grazing and corner collision are the names of M. di Bernardo, C. Budd, A. Champneys, P. Kowalczyk,
 Piecewise-smooth Dynamical Systems, 2008.
@@ -60,8 +60,8 @@ class EdgeContact(CycleSystem):
         return end_guard(osc, self.codes, self.end, z[following, :2])
 
     def judge(self, osc, z, cycle, slope):
-        # A cycle with an extremum of x1 at once after the edge solves the equations, too, but there
-        # they are singular; and a cycle that has shrunk to a pseudo-focus meets everything there.
+        # A cycle with an extremum of x1 at once after the edge solves the equations, too, but they
+        # are singular there; a cycle that has shrunk to a pseudo-focus satisfies every condition.
         turns = cycle.chain.ends[self.row] == Ends(len(osc.belts)).extremum_x1
         shrunk = jnp.ptp(z[:, 0]) < AT_REST
         fails = turns & (z[self.row, 2] < 1e-6) | shrunk
@@ -73,7 +73,7 @@ class EdgeContact(CycleSystem):
 
     def watch(self, osc, z, slope):
         own = self._ends_there(z)
-        # The corner's own boundary; that of another belt may come there, too.
+        # The boundary of the corner itself is not watched; that of another belt may come there.
         belts = jnp.arange(len(osc.belts))
         belts = (belts == self.chain.ends[self.row]) | (belts == self.end)
         tests = arrival_tests(osc, self.chain, z, self.row, own[:, None] & belts[None])
@@ -81,10 +81,10 @@ class EdgeContact(CycleSystem):
         return tests, True, jnp.nan
 
     def _ends_there(self, z: Array) -> Array:
-        """The arcs that end where and when that of the row does, [arcs].
+        """Mask of the arcs that end where and when the arc `row` does, [arcs].
 
-        That is the arc itself, and the one before or after it that ends in the other event with no
-        time between them.
+        These are the arc itself, and the one before or after it that ends in the other event with
+        no time between them.
         """
         rows, count = jnp.arange(self.chain.ends.size), jnp.sum(self.chain.used)
         before, after = (self.row - 1) % count, (self.row + 1) % count
@@ -98,10 +98,10 @@ class EdgeContact(CycleSystem):
 class AbstractEdgeTouch(AbstractCycleCondition):
     """An arc of a cycle ends on an edge of a belt and in a second event at once.
 
-    Of all attracting cycles the one that comes nearest to this is taken. wanted: 1 for an extremum
-    of x1 (grazing), -1 for a boundary or slip onset (a corner), 0 for either. repels: the cycle is
-    the one from `unstable_cycle`, not an attracting one. farther: ends of arcs that are no farther
-    from both are left out.
+    The guess is the attracting cycle that comes nearest to it. wanted: 1 for an extremum of x1
+    (grazing), -1 for a boundary or slip onset (a corner), 0 for either. repels: the cycle is
+    the one from `unstable_cycle`, not an attracting one. farther: only ends of arcs at a distance
+    from both events larger than this count.
     """
 
     belt: int | Array
@@ -144,7 +144,7 @@ class AbstractEdgeTouch(AbstractCycleCondition):
         return nearest(osc, size, self)
 
     def guess_near(self, beginning):
-        # In as many rows as those of the guess, so that one program serves both.
+        # In as many rows as the loop of `guess`, so that one program serves both.
         return beginning, jnp.asarray(Status.OK.value)
 
     def distance(self, osc: Oscillator, loop: Loop) -> Array:
@@ -176,7 +176,7 @@ class AbstractEdgeTouch(AbstractCycleCondition):
 
 
 class EdgeTouch(AbstractEdgeTouch):
-    """Such an end with either second event, as data for programs."""
+    """The condition with either second event, as data of the compiled programs."""
 
     wanted: float | Array = 0.0
     farther: float | Array = -1.0
@@ -186,9 +186,9 @@ class EdgeTouch(AbstractEdgeTouch):
 class GrazingEdge(AbstractEdgeTouch):
     """The cycle is tangent to a contact edge of a belt: an extremum of x1 touches it.
 
-    Beyond, the cycle passes the edge; or there is none, where the edge pushes away to both sides. A
-    cycle that passes the edge ends there, too, with the velocity zero on it. With forcing it is a
-    periodic motion that touches.
+    Beyond the point the cycle passes the edge; where the edge pushes away to both sides, there is
+    no cycle. A cycle that passes the edge ends there, too, with the velocity zero on it. With
+    forcing it is a periodic motion that touches.
 
     Args:
         belt: Number of the belt.
@@ -229,10 +229,10 @@ class GrazingEdge(AbstractEdgeTouch):
 class CornerCollision(AbstractEdgeTouch):
     """The cycle runs into a corner of a contact edge of a belt and a boundary r_k = 0.
 
-    It begins, or ceases, to stick to a belt there, or crosses its boundary: beyond, these come in
-    another order, or another event comes instead; or, like at a nonsmooth fold, there is no cycle.
-    A guess has to lie on a side where there is a cycle; `scan` tries both. With forcing it is a
-    periodic motion, and goes on.
+    There it begins, or ceases, to stick to a belt, or crosses its boundary. Beyond the point these
+    events come in another order, or another event comes instead; or, like at a nonsmooth fold,
+    there is no cycle. A guess has to lie on a side with a cycle; `scan` tries both. With forcing
+    it is a periodic motion, which goes on beyond the point.
 
     Args:
         belt: Number of the belt.
@@ -265,7 +265,7 @@ def _guard_at_rest(osc: Oscillator, codes: Array, x1: Array, end: Array) -> Arra
 class EdgeEnd(eqx.Module):
     """The end of an arc that comes nearest to an edge and a second event at once.
 
-    distance: from these, inf if there is none; row, end, codes: as for `EdgeContact`; grazes:
+    distance: from both, inf if there is no such end; row, end, codes: as for `EdgeContact`; grazes:
     whether the orbit would be tangent to the edge, else it would run into a corner.
     """
 
@@ -294,13 +294,13 @@ def end_near_edge(
     positions = jnp.stack(edges(osc))
     lower, upper = positions[belt], positions[n + belt]
     following = following_codes(loop)
-    # The boundary of a belt at rest is where x1 is extreme; without a load it is nothing else.
+    # At the boundary of a belt at rest x1 is extreme; without a load the boundary is nothing else.
     idle = [(one.velocity == 0) & (one.load == 0) for one in osc.belts]
     extreme = jnp.array([*range(n), names.extremum_x1])
     extreme = jnp.where(jnp.stack([*idle, jnp.asarray(True)]), extreme, names.extremum_x1)
 
     def distances(codes, end, entry, after, at):
-        """Distances from every end that this arc might have as well; stick phases in two modes."""
+        """Distances from every other end that this arc might have; slip onset in two modes."""
         x1, x2 = at
         on_edge = (end >= n) & (end < 3 * n)
         edge = positions[jnp.clip(end - n, 0, 2 * n - 1)]
@@ -309,22 +309,22 @@ def end_near_edge(
         # The second event ends the arc: its distance from an edge.
         turns, meets = jnp.any(end == extreme), (end < n) | (end == names.onset)
         to_edges = [jnp.where(turns | meets, jnp.abs(x1 - e), jnp.inf) for e in (lower, upper)]
-        # An edge ends the arc. If that pushes away to both sides: the distance to the extremum of
+        # An edge ends the arc. If the edge pushes away to both sides: distance to the extremum of
         # x1 that the orbit would reach without the edge. It moves there in the direction of x1 on
         # this arc; x2 itself may be zero.
         ahead = jnp.sign(x1 - entry[0])
         push = [ahead * mode_acceleration(osc, mode_of(c), x1, x2) for c in (codes, after)]
         passes = on_edge & ~stuck & (push[0] < 0) & (push[1] > 0)
         to_extremum = jnp.where(passes, 0.5 * x2**2 / jnp.where(passes, -push[0], 1.0), jnp.inf)
-        # A boundary may be near that the arc did not begin at: x2 is monotone on it.
+        # A boundary at which the arc did not begin may be near: x2 is monotone on the arc.
         to_boundaries = []
         for i, one in enumerate(osc.belts):
             r, began = (one.velocity - osc.omega * v for v in (x2, entry[1]))
             touches = (jnp.abs(codes[i]) < 1.5) | (jnp.abs(after[i]) < 1.5)
             near = on_edge & ~stuck & touches & (jnp.abs(began) > HOLDS)
             to_boundaries.append(jnp.where(near, jnp.abs(r), jnp.inf))
-        # Slip onset may be near: in the mode before the edge or, if the edge is left by it, in the
-        # mode after.
+        # Slip onset may be near: in the mode before the edge, or in the mode after it with the
+        # stuck belts still stuck.
         held = jnp.where((codes == 0) & (jnp.abs(after) < 1.5), 0.0, after)
         to_onsets = []
         for one in (codes, held):
@@ -348,9 +348,9 @@ def end_near_edge(
 
 
 def _without_excursion(osc: Oscillator, loop: Loop, near: EdgeEnd) -> tuple[Loop, Array]:
-    """The loop without its part beyond the edge, and the row that then ends in the extremum.
+    """The loop without its excursion beyond the edge, and the row that then ends in the extremum.
 
-    Only if all of that part is the extremum of x1 that ends a row.
+    The excursion is left out only if the extremum of x1 at the end of a row is its only event.
     """
     row = near.row
     n = len(osc.belts)
@@ -359,7 +359,7 @@ def _without_excursion(osc: Oscillator, loop: Loop, near: EdgeEnd) -> tuple[Loop
     passes = (loop.ends >= n) & (loop.ends < 3 * n)
     edge = edge_at(osc, jnp.clip(near.end - n, 0, 2 * n - 1))
     passes = passes & (loop.exits[:, 0] == edge)
-    # The events before and after; extremum of x2 are none.
+    # The events before and after the row; extrema of x2 do not count.
     events = loop.used & (loop.ends != names.extremum_x2) & (rows != row)
     before = jnp.argmin(jnp.where(events, (row - rows) % count, rows.size))
     after = jnp.argmin(jnp.where(events, (rows - row) % count, rows.size))

@@ -1,9 +1,9 @@
 """Folds of cycles that do not stick: `FoldOfCycles`.
 
 The multiplier of such a cycle is one. There the equations of the cycle alone are singular; with
-this one, and the parameter, they are not. (A cycle that sticks has the multiplier zero and takes
-part in nonsmooth folds only.) Yu. Kuznetsov, Elements of Applied Bifurcation Theory, chapter 5, has
-the fold of a cycle in smooth systems.
+this equation, and the parameter as an unknown, they are regular. (A cycle that sticks has the
+multiplier zero and takes part in nonsmooth folds only.) Yu. Kuznetsov, Elements of Applied
+Bifurcation Theory, chapter 5, has the fold of a cycle in smooth systems.
 """
 
 from typing import ClassVar
@@ -61,8 +61,8 @@ class UnitMultiplier(CycleSystem):
         sticks = self.chain.used & jnp.any(self.chain.codes == 0, axis=-1)
         nearest, _ = nearest_contacts(osc, self.chain, z, sticks)
         tests = contact_tests("FoldGrazing", nearest, jnp.ones(nearest.shape, bool))
-        # Largest x1 less its mean. Beyond an equilibrium the equations go on with the largest and
-        # the smallest exchanged.
+        # Largest x1 minus its mean. Beyond an equilibrium the equations still have solutions, with
+        # the largest and the smallest x1 exchanged.
         size = z[0, 0] - jnp.mean(z[:, 0], where=self.chain.used)
         return tests, size > 0, jnp.where(jnp.any(sticks), 0.0, slope)
 
@@ -70,9 +70,9 @@ class UnitMultiplier(CycleSystem):
 class FoldOfCycles(AbstractCycleCondition):
     """Two cycles that do not stick, a stable and an unstable one, meet and vanish.
 
-    Near a degenerate Hopf point, where both shrink to the equilibrium, small ones are not found. In
-    the tests' example cycles with x1_max - x1_min above 0.006 are found, from guesses about twice
-    as far from the point as the point is from the Hopf point.
+    Near a degenerate Hopf point, where both shrink to the equilibrium, small cycles are not found.
+    In the tests' example cycles with x1_max - x1_min above 0.006 are found, from guesses about
+    twice as far from the point as the point is from the Hopf point.
     """
 
     caption: ClassVar[str] = "fold of cycles"
@@ -109,12 +109,12 @@ class FoldOfCycles(AbstractCycleCondition):
 
 @jit
 def _extremal_loop(osc: Oscillator, rests: Equilibria, size: int):
-    """A loop that nearly closes, as do its neighbours; and a status.
+    """A loop that nearly closes, as do its neighbours, near where two cycles meet; and a status.
 
-    Two cycles meet there. It is the first loop whose growth is extremal among its neighbours'; of
-    several the one that closes best. Near a fixed point with eigenvalues rate +- i frequency the
-    growth tends to 2 pi rate/frequency, and it has an extremum there that is only an effect of
-    where loops begin: it differs from that limit by a term of second order in the rate.
+    It is the first loop of an orbit whose growth is extremal among those of its neighbours; of
+    several such loops the one that closes best. Near a fixed point with eigenvalues rate +- i
+    frequency the growth tends to 2 pi rate/frequency, and has an extremum there that is only an
+    effect of where loops begin: it differs from that limit by a term of second order in the rate.
     """
     still, rests = lax.stop_gradient((osc, rests))
     eligible = (rests.kind != EquilibriumKind.SEGMENT) & (rests.kind > 0)
@@ -133,7 +133,7 @@ def _extremal_loop(osc: Oscillator, rests: Equilibria, size: int):
         distances = jnp.exp(jnp.linspace(jnp.log(bracket[0]), jnp.log(bracket[1]), STARTS))
         orbits, growth, sticks = each(loop)(distances)
         change = jnp.diff(growth)
-        # Its neighbours may stick; the extremum lies beside them.
+        # The neighbours of an extremum may stick, the extremum itself may not.
         extremal = (change[1:] * change[:-1] < 0) & ~sticks[1:-1]
         extremal = extremal & (jnp.abs(growth - limit) > 0.05 * jnp.abs(growth))[1:-1]
         at = 1 + jnp.argmin(jnp.where(extremal, jnp.abs(growth[1:-1]), jnp.inf))

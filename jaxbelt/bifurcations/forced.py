@@ -6,14 +6,14 @@ unknown, the parameter:
 - `PeriodDoubling`, `Fold`, `Torus`: a multiplier of -1 or 1, or a pair of modulus 1, in terms of
   trace and determinant of the monodromy matrix M: 1 + tr + det = 0, 1 - tr + det = 0, det = 1.
 - `GrazingSliding`: a slip arc touches the boundary of a belt, r = r' = 0.
-- `CrossingSliding`, `SwitchingSliding`: it arrives at the boundary where the force that is needed
+- `CrossingSliding`, `SwitchingSliding`: a slip arc arrives at the boundary where the force needed
   to stick is just what the belt can hold, with the sign with which it arrives; that force rises
   (crossing) or falls (switching).
-- `AddingSliding`: inside a stick phase the force that is needed touches the limit.
+- `AddingSliding`: inside a stick phase the force needed to stick touches the limit of the belt.
 
 M. di Bernardo, P. Kowalczyk, A. Nordmark, Int. J. Bifurcation Chaos 13 (2003) 2935, have the four
-sliding bifurcations; contact edges are in `forced_edges`. What touches begins as an arc that is cut
-there, or from an arc beyond that is left out.
+sliding bifurcations; contact edges are in `forced_edges`. The guess of a motion that touches has an
+arc that is cut where it nearly touches, or lacks the short arc beyond.
 """
 
 import itertools
@@ -54,13 +54,13 @@ from .base import AbstractCondition, BifurcationPoint, Line, point_of, point_wit
 from .systems import solve_system
 from .timed_systems import AtLimit, OnUnitCircle, TimedSystem, Touching, place_of_motion
 
-#: Places of a motion from which a condition is tried, the most promising ones first.
+#: Number of guesses from a motion from which a condition is solved, the most promising ones first.
 TRIED = 4
-#: Minima of guards earlier than this part of an arc are those at which it began.
+#: A minimum of a guard earlier than this part of an arc is that of the event at which it began.
 AT_ONSET = 1e-6
-#: Arcs whose durations differ by a smaller part may be images of one another.
+#: Arcs whose durations differ by less than this part may be images of one another.
 ALIKE_ARCS = 0.1
-#: Smaller jumps between static and kinetic friction, and of what they do in own units, are none.
+#: Jumps from static to kinetic friction, and their effects in own units, count as zero below this.
 SMALLEST_JUMP = 1e-6
 #: States from which motions are looked for, in own units.
 STARTS_OF_MOTIONS = (
@@ -93,13 +93,13 @@ class ArcRows(NamedTuple):
         return cls(*(np.asarray(part)[used] for part in parts), share=motion.chain.share)
 
     def ending(self, row: int, end: int) -> "ArcRows":
-        """With another end of the arc of a row."""
+        """The same arcs, with another end of the arc of a row."""
         ends = self.ends.copy()
         ends[row] = end
         return self._replace(ends=ends)
 
     def put(self, first: int, last: int, *rows: tuple[Any, Any, Any]) -> "ArcRows":
-        """With (codes, end, unknowns) in place of the arcs from the first up to the last one."""
+        """The arcs with rows (codes, end, unknowns) in place of those from `first` up to `last`."""
         new = [np.array(list(column)) for column in zip(*rows, strict=True)]
         parts = [
             np.concatenate([own[:first], some.astype(own.dtype), own[last + 1 :]])
@@ -108,14 +108,14 @@ class ArcRows(NamedTuple):
         return ArcRows(*parts, share=self.share)
 
     def cut(self, row: int, since: float, state: np.ndarray, end: int) -> "ArcRows":
-        """With an arc cut where it is at `state`, (x1, x2, t), by that end."""
+        """The arcs, one cut by `end` at `state`, (x1, x2, t), a time `since` after its entry."""
         codes, z = self.codes[row], self.z[row]
         first = (codes, end, np.append(z[:3], since))
         return self.put(row, row, first, (codes, self.ends[row], np.append(state, z[3] - since)))
 
     def without(self, row: int, end: int | None) -> "ArcRows":
-        """Without the short arc of a row: the one before goes on, cut in the middle of the short
-        one by an end; None: not cut."""
+        """The arcs without the short one of a row: the arc before goes on instead, cut by an end in
+        the middle of the short one; None: not cut."""
         last, phase, then = self.z[row - 1 : row + 2]
         codes, half = self.codes[row - 1], 0.5 * phase[3]
         if end is None:
@@ -131,7 +131,7 @@ class ArcRows(NamedTuple):
 
 
 class Beginning(NamedTuple):
-    """Arcs near a point, how far from it they seem to be, and what makes its system of a chain."""
+    """A guess: arcs, their estimated distance from a point, and a function from chain to system."""
 
     rows: ArcRows
     distance: float
@@ -149,22 +149,22 @@ class AbstractForcedCondition(AbstractCondition):
         return self
 
     def kind_along(self, osc, multiplier) -> type[AbstractCondition]:
-        # Conditions that are there without a clock, too, have a class of their own here.
+        # A condition that exists without a clock, too, has that class as its field `public`.
         return getattr(self, "public", type(self))
 
     def beginnings_of(
         self, osc: Oscillator, motion: PeriodicMotion, known: bool = False
     ) -> Iterator[Beginning]:
-        """Where its system may begin from a motion of a known oscillator in own units.
+        """Guesses for the condition from a motion of a known oscillator in own units.
 
-        known: the motion is that of one of its points.
+        known: whether the motion is that of a solved point of the condition.
         """
         raise NotImplementedError
 
     def points(
         self, variation: Variation, value: Any, motion: PeriodicMotion
     ) -> list[BifurcationPoint]:
-        """The points that are found from a motion at a value, [1], of what is varied."""
+        """The points that are found from a motion at a value, [1], of the parameter."""
         osc = lax.stop_gradient(variation.oscillator(value))
         motion = begun_off_events(osc, motion)
         some = sorted(self.beginnings_of(osc, motion), key=lambda one: one.distance)
@@ -174,8 +174,8 @@ class AbstractForcedCondition(AbstractCondition):
     def _of_least_periods(
         self, variation: Variation, point: BifurcationPoint
     ) -> list[BifurcationPoint]:
-        """The point; where a motion of more periods has shrunk onto one of fewer there, those of
-        the latter."""
+        """The point; or, where its motion of more periods has shrunk onto one of fewer, the points
+        found from the latter."""
         if int(point.status) != Status.OK:
             return [point]
         osc, value, motion = lax.stop_gradient((point.oscillator, point.value, point.cycle))
@@ -187,14 +187,14 @@ class AbstractForcedCondition(AbstractCondition):
     def point_of(
         self, variation: Variation, osc: Oscillator, value: Any, beginning: Beginning
     ) -> BifurcationPoint:
-        """The point that is found from one beginning."""
+        """The point that is found from one guess."""
         return self.solve(variation, osc, value, beginning)
 
     def guess(self, osc, size):
         raise NotImplementedError
 
     def named_point_beside(self, variation, value, osc, system, x):
-        # From the motion at this value, which may have another signature.
+        # Start from the motion at this value, which may have another signature.
         chain, at = system.chain, np.array([value])
         start, periods = state_at_phase_0(osc, chain, jnp.asarray(x)), periods_of(chain)
         motion = periodic_from(variation.oscillator(at), start, periods, chain.turns)
@@ -244,11 +244,11 @@ def forced_point(
 ) -> BifurcationPoint:
     """The nearest point of a condition that is found from the motions at a value, [1].
 
-    start: one of these motions, or a state at the phase 0 that leads to one; None: all that are
-    found from some states.
+    start: one of these motions, or a state at the phase 0 that leads to one; None: all motions that
+    are found from `STARTS_OF_MOTIONS`.
     """
     timed = condition.with_clock()
-    # Where it is looked for makes no difference to a point.
+    # A point does not depend on where the search for it begins.
     value = lax.stop_gradient(value)
     near = lax.stop_gradient(variation.oscillator(value))
     require(
@@ -266,7 +266,7 @@ def forced_point(
 
     found, fine = points_from(motions)
     if isinstance(start, PeriodicMotion) and not fine:
-        # The arcs of a motion that is known may be those at another value, or at a point.
+        # A given motion may have the arcs of another value, or of a point.
         again = [periodic_from(own, np.asarray(m.start), m.periods, turns) for m in motions]
         found, fine = points_from(m for m in again if int(m.status) == Status.OK)
     guess = float(np.asarray(lax.stop_gradient(value))[0])
@@ -283,8 +283,8 @@ def forced_point(
 
 
 def motions_to_begin_from(osc: OwnOscillator, start: Any, turns: int) -> Sequence[PeriodicMotion]:
-    """The motions to begin from; of those with an even number of periods also the one between
-    their halves, from which they may have left."""
+    """The motions to begin from; for each one of an even number of periods also the motion between
+    its halves, which it may have left in a period doubling."""
     if isinstance(start, PeriodicMotion):
         return [rescaled(start, 1 / osc.units.length, lambda _: osc)]
     if start is not None:
@@ -338,7 +338,7 @@ class Fold(UnitCircle):
 class Torus(UnitCircle):
     """A pair of multipliers has modulus 1: the motion loses its stability to a torus around it.
 
-    The motion on the torus is quasi-periodic, or locked to the forcing. What sticks has no torus.
+    The motion on the torus is quasi-periodic, or locked to the forcing. Sticking motions have none.
     """
 
     caption: ClassVar[str] = "torus"
@@ -388,8 +388,8 @@ class TimedGrazing(AbstractForcedCondition):
                     yield Beginning(touching, speed**2, system(row))
 
     def _jump_at(self, osc: Oscillator, before: Any, after: Any, y: Array) -> float | None:
-        """How fast a mass comes to the boundary at which it begins to stick; None where the law of
-        friction does not jump there, and the mass would not stick if it only touched."""
+        """|r'| where the mass comes to the boundary and begins to stick; None where the law of
+        friction does not jump, so that a mass that only touched would not stick."""
         excess, _ = _excess(osc, jnp.asarray(after), y)
         slopes = _guard_slopes(osc, jnp.asarray(before), y)
         speed = abs(float(slopes[self.belt]))
@@ -397,8 +397,8 @@ class TimedGrazing(AbstractForcedCondition):
 
     @staticmethod
     def _may_end(rows: ArcRows, row: int, belt: int) -> bool:
-        """Whether an arc is a stick phase to a belt, or to more belts of its velocity, from which
-        the slip before goes on."""
+        """Whether an arc is a stick phase to a belt (and others of its velocity) after which the
+        mass slips on in the mode before it."""
         codes = rows.codes[row - 1 : row + 2]
         before, here, after = codes[:, belt]
         differ = codes[:, np.any(codes != codes[:, [belt]], axis=0)]
@@ -432,7 +432,7 @@ class _AtArrival(AbstractForcedCondition):
                 continue
             yield Beginning(rows, abs(float(distance)), system(row, held))
             if row in soon:
-                # Maybe the excursion is to vanish; those of a symmetric motion do so at once.
+                # The excursion may vanish at the point; those of a symmetric motion do so together.
                 gone = rows.z[row + 1, 3]
                 alike = [r for r in soon if abs(rows.z[r + 1, 3] - gone) <= ALIKE_ARCS * gone]
                 for some in [alike, [row]] if len(alike) > 1 else [[row]]:
@@ -442,7 +442,7 @@ class _AtArrival(AbstractForcedCondition):
 
 
 def _short_crossings(rows: ArcRows) -> list[int]:
-    """The arcs behind which the mass crosses the boundary of a belt, comes back, and sticks."""
+    """Rows of arcs after which the mass crosses the boundary of a belt, comes back, and sticks."""
     found = []
     for row, belt in enumerate(rows.ends[:-2].tolist()):
         if belt < rows.codes.shape[1] and rows.ends[row + 1] == belt:
@@ -453,7 +453,7 @@ def _short_crossings(rows: ArcRows) -> list[int]:
 
 
 def _without_crossings(rows: ArcRows, some: list[int]) -> ArcRows:
-    """The arcs without the excursions behind some, which stick at once."""
+    """The arcs without the excursions after the rows `some`: the mass sticks there at once."""
     for row in reversed(some):
         gone, phase = rows.z[row + 1], rows.z[row + 2]
         longer = np.append(gone[:3], phase[3] + gone[3])
@@ -463,7 +463,7 @@ def _without_crossings(rows: ArcRows, some: list[int]) -> ArcRows:
 
 @jit
 def _excess(osc: Oscillator, codes: Array, y: Array) -> tuple[Array, Array]:
-    """By how much the force that is needed exceeds what the stuck belts hold, and its rate."""
+    """Force needed to stick minus what the stuck belts can hold, and its rate of change."""
     mode = mode_of(codes)
     at = guards_trend(osc, mode, y)
     value, slope = at.value[-2:], at.slope[-2:]
@@ -504,9 +504,9 @@ class SwitchingSliding(_AtArrival):
 class AddingSliding(AbstractForcedCondition):
     """Inside a stick phase the force that is needed touches what the belt can hold.
 
-    Beyond the point the phase is two: in between the mass slips and sticks again. Where the belt's
-    static friction is above its kinetic friction the slip is not short; then a phase that ends
-    touches there, and beyond the point it goes on.
+    Beyond the point there are two phases: in between the mass slips and sticks again. Where the
+    belt's static friction is above its kinetic friction the slip is not short; then a phase that
+    ends in slip onset only touches the limit at the point, and goes on beyond the point.
 
     Args:
         belt: Number of the belt.
@@ -558,17 +558,17 @@ def friction_jumps(osc: Oscillator, belt: int) -> bool:
 def without_one_of(
     rows: ArcRows, short: list[int], end: int, others: Sequence[int] = ()
 ) -> Iterator[tuple[ArcRows, int, float]]:
-    """The arcs without one of some that may end, cut there by an end; the row that is cut;
-    and the square of the duration that is left out.
+    """The arcs without one of the `short` ones, cut there by `end`; the row that is cut; and the
+    square of the duration that is left out.
 
-    Arcs of one duration are left out together first: those of a symmetric motion end at once, and
-    one touches only where the others do. others: arcs of other kinds that may vanish at once with
-    these, of whatever duration, as those of two belts do where a motion touches both boundaries.
+    Arcs of one duration are left out together first: those of a symmetric motion vanish at once,
+    and one touches only where the others do. others: arcs of other kinds, of any duration, that may
+    vanish at once with these, as those of two belts do where a motion touches both boundaries.
     """
     for row in short:
         duration, alike = rows.z[row, 3], [row]
         for i in short:
-            # Of arcs that follow one another one lies between two others.
+            # Of neighbouring arcs only one is left out: it lies between the other ones.
             beside = any(abs(i - k) < 2 for k in alike)
             if not beside and abs(rows.z[i, 3] - duration) < ALIKE_ARCS * duration:
                 alike.append(i)
@@ -583,8 +583,8 @@ def without_one_of(
 
 
 def minima_of_guards(osc: Oscillator, motion: PeriodicMotion, some: slice) -> Iterator[tuple]:
-    """Where some guards of the arcs of a motion, in their order, have a minimum inside: the row,
-    the time since its entry, the state (x1, x2, t), and the value there."""
+    """Minima inside of arcs of the guards in the slice `some` of their order: the row, the time
+    since the entry of the arc, the state (x1, x2, t), and the value of the guard there."""
     found = guards_along(osc, motion.chain, motion.unknowns)
     states, value, slope = map(np.asarray, found)
     for row in np.flatnonzero(np.asarray(motion.chain.used)).tolist():

@@ -1,9 +1,10 @@
 """Contact edges and periodic motions of forced oscillators: `GrazingEdge`, `CornerCollision`.
 
-An arc ends in two events at once, in one of which it ends anyway; the guard of the other one is the
-condition. A motion that touches an edge is cut where x2 = 0, and x1 is on the edge there. Beyond
-the edge, where its belt comes or goes, it has one more arc, which lasts for the square root of the
-distance: that is left out. In a corner an edge and a boundary, or slip onset, come together.
+An arc ends in two events at once: one of them is the end of the arc, and the guard of the other one
+is the condition. A motion that touches an edge is cut where x2 = 0, and the condition is that x1 is
+on the edge there. A motion that goes beyond the edge, where its belt comes or goes, has one more
+arc, whose duration goes like the square root of the distance: it is left out of the guess. In a
+corner an edge and a boundary, or slip onset, come together.
 """
 
 import itertools
@@ -29,9 +30,9 @@ from .base import AbstractCondition, BifurcationPoint
 from .forced import AbstractForcedCondition, ArcRows, Beginning, minima_of_guards, without_one_of
 from .timed_systems import ARRIVES, TimedSystem
 
-#: How long a motion is to be beyond an edge behind the point where it touches it, in own units.
+#: Durations of arcs beyond an edge with which motions beyond a touch are sought, in own units.
 EXCURSIONS = (3e-2, 1e-2, 3e-3)
-#: A motion this near to an edge touches it; between the steps of one it may.
+#: A motion nearer to an edge than ON_THE_EDGE touches it; one with a step within MAY_TOUCH may.
 ON_THE_EDGE, MAY_TOUCH = 1e-6, 1e-2
 
 
@@ -59,14 +60,14 @@ class ArcOfDuration(TimedSystem):
 
 
 class AbstractTimedEdge(AbstractForcedCondition):
-    """A condition on an edge with a clock; public: its class without one."""
+    """A condition on an edge with a clock; public: its class without a clock."""
 
     belt: int
     public: type[AbstractCondition] = eqx.field(static=True)
 
     def ends_of_edges(self, osc: Oscillator) -> Iterator[tuple[int, np.ndarray]]:
-        """Of each edge of the belt, of a known oscillator, its number in `Ends`, and those of all
-        edges at the same place."""
+        """For each finite edge of the belt, its number in `Ends` and those of all edges at its
+        place; the oscillator has to be known."""
         n, places = len(osc.belts), _edge_places(osc)
         for edge in (self.belt, n + self.belt):
             if np.isfinite(places[edge]):
@@ -76,7 +77,7 @@ class AbstractTimedEdge(AbstractForcedCondition):
 def _both(
     rows: ArcRows, distance: float, row: int, end: int, codes: np.ndarray | None = None
 ) -> Beginning:
-    """The arc of a row is to end in another event as well, in its own mode or that of the codes."""
+    """A guess: the arc of a row ends in the event `end` as well, in its own mode or in `codes`."""
     codes = rows.codes[row] if codes is None else codes
     numbers = [jnp.asarray(one) for one in (row, codes, end)]
     return Beginning(rows, distance, lambda chain: TwoEvents(chain, *numbers))
@@ -88,7 +89,7 @@ class TimedEdgeGrazing(AbstractTimedEdge):
     def beginnings_of(self, osc, motion, known=False):
         rows, names = ArcRows.of(motion), Ends(len(osc.belts))
         for edge, same in self.ends_of_edges(osc):
-            # Where a belt is at rest its boundary is where x1 is extreme.
+            # These include arcs to the boundary of a belt at rest: x1 is extreme there, too.
             for row in _turning(rows):
                 yield _both(rows, _off_edge(osc, rows, row, edge), row, edge)
             if known:
@@ -104,10 +105,10 @@ class TimedEdgeGrazing(AbstractTimedEdge):
     def motions_beyond(
         self, variation: Variation, point: BifurcationPoint
     ) -> Iterator[BifurcationPoint]:
-        """Motions that go beyond the edge for a short time, and the values at which they do.
+        """Motions that go beyond the edge for a short time, each as a point with its value.
 
-        Of one that touches other edges, too, as symmetric ones do, at first those that go beyond
-        all of them.
+        If the motion of the point touches other edges, too, as symmetric ones do, those that go
+        beyond all of the edges come first.
         """
         value = np.array([float(point.value)])
         osc, rows = in_own_units(variation.oscillator(value)), ArcRows.of(point.cycle)
@@ -164,8 +165,8 @@ class TimedCorner(AbstractTimedEdge):
     def _others_on_edge(
         self, before: np.ndarray, after: np.ndarray, onset: int
     ) -> Iterator[tuple[np.ndarray, int]]:
-        """Other events of an arc that ends on an edge: in the modes of which codes, and their
-        numbers."""
+        """Second events of an arc that ends on an edge: codes of the mode in which each has its
+        guard, and its number in `Ends`."""
         if np.any(before == STUCK):
             held = np.where((before == STUCK) & (np.abs(after) < 2), STUCK, after)
             yield from ((codes, onset) for codes in (before, held) if np.any(codes == STUCK))
@@ -177,8 +178,8 @@ class TimedCorner(AbstractTimedEdge):
 def _touching_all(
     osc: Oscillator, motion: PeriodicMotion, row: int, edge: int
 ) -> tuple[ArcRows, list[tuple[int, int]]]:
-    """The arcs of a motion, cut where it touches other edges than that one, at which the arc of a
-    row ends; and the rows that end on edges, with these, in order."""
+    """The arcs of a motion, cut where it touches edges other than `edge`, on which the arc `row`
+    ends; and (row, edge) of all arcs that touch an edge, in order."""
     rows, names, n = ArcRows.of(motion), Ends(len(osc.belts)), len(osc.belts)
     places, known, others = _edge_places(osc), _at_same_place(osc, edge).tolist(), []
     for other in (n + np.flatnonzero(np.isfinite(places))).tolist():
@@ -199,7 +200,7 @@ def _touching_all(
 def _with_excursions(
     osc: Oscillator, rows: ArcRows, touches: list[tuple[int, int]], duration: float
 ) -> ArcRows | None:
-    """`_with_excursion` for all rows that touch edges, which are in order."""
+    """`_with_excursion` for all touches, (row, edge), which are in order."""
     beyond: ArcRows | None = rows
     for row, edge in reversed(touches):
         same = _at_same_place(osc, edge)
@@ -210,7 +211,7 @@ def _with_excursions(
 def _with_excursion(
     osc: Oscillator, rows: ArcRows, row: int, edge: int, same: np.ndarray, duration: float
 ) -> ArcRows | None:
-    """The arcs with one beyond the edge where that of a row touches it; None where the mass does
+    """The arcs with one more, beyond the edge that the arc `row` touches; None where the mass does
     not come back from there."""
     n, place = len(osc.belts), _edge_places(osc)[edge - len(osc.belts)]
     time, codes = rows.z[row + 1, 2], rows.codes[row].copy()
@@ -236,23 +237,23 @@ def _with_excursion(
 
 
 def _turning(rows: ArcRows) -> list[int]:
-    """The arcs that end where x2 = 0."""
+    """Rows of the arcs that end where x2 = 0."""
     return np.flatnonzero(np.abs(rows.z[1:, 1]) < ARRIVES).tolist()
 
 
 def _off_edge(osc: Oscillator, rows: ArcRows, row: int, end: int) -> float:
-    """How far from an edge an arc ends."""
+    """Distance of the end of an arc from the edge of number `end`."""
     return abs(_edge_places(osc)[end - len(osc.belts)] - rows.z[row + 1, 0])
 
 
 def _is_excursion(rows: ArcRows, row: int, ends: np.ndarray) -> bool:
-    """Whether an arc begins and ends on an edge, and the one before it goes on behind it."""
+    """Whether an arc begins and ends on an edge, between two arcs of one mode."""
     passes = rows.ends[row - 1] in ends and rows.ends[row] in ends
     return bool(passes and np.array_equal(rows.codes[row - 1], rows.codes[row + 1]))
 
 
 def _at_same_place(osc: Oscillator, end: int) -> np.ndarray:
-    """The numbers in `Ends` of all edges at the place of one."""
+    """The numbers in `Ends` of all edges at the place of the edge `end`."""
     n, places = len(osc.belts), _edge_places(osc)
     return n + np.flatnonzero(places == places[end - n])
 
@@ -262,7 +263,7 @@ def _edge_places(osc: Oscillator) -> np.ndarray:
 
 
 def edged_belts(osc: Oscillator) -> list[int]:
-    """The numbers of the belts that have a contact edge, and a load, of a known oscillator."""
+    """Numbers of the belts of a known oscillator that have a finite contact edge and a load."""
     edged = np.any(np.isfinite(_edge_places(osc).reshape(2, -1)), axis=0)
     loads = [belt.load for belt in osc.belts]
     loaded = [isinstance(load, Oscillating) or float(load) != 0 for load in loads]

@@ -1,9 +1,9 @@
 """Ends of curves of forced oscillators in points where two conditions hold: `meeting_point`.
 
 The curve of a multiplier ends where the signature of its motion does, and a curve of a motion that
-a period doubling has left ends where its two halves come together. There the motion ceases to
-exist, or its equations are singular. The equations of the other curve through that point are
-regular, and the condition in question is one of the functions that are watched along it.
+has left another one in a period doubling ends where its two halves come together. There the motion
+ceases to exist, or its equations are singular. The equations of the other curve through that point
+are regular, and the condition on a multiplier is one of the functions watched along it.
 """
 
 from collections.abc import Iterator
@@ -35,14 +35,14 @@ from .tangencies import GrazingSliding
 from .timed_systems import place_of_motion
 from .tracks import Track, special_between
 
-#: How far from the last row such a point may be, in steps of the curve.
+#: Largest distance of a meeting point from the last row, in steps of the curve.
 REACH = 3
-#: Points of the other curve that are looked at to each side.
+#: Number of points of the other curve that are computed to each side.
 POINTS_TO_A_SIDE = 5
 
 
 def borders_of(osc: Oscillator) -> list[AbstractCondition]:
-    """The conditions on which signatures of an oscillator's motions end."""
+    """The conditions at whose points the signature of a forced motion ends."""
     kinds = GrazingSliding, CrossingSliding, SwitchingSliding, AddingSliding
     sliding = [kind(belt) for kind in kinds for belt in range(len(osc.belts))]
     of_edges = [kind(belt) for kind in (GrazingEdge, CornerCollision) for belt in edged_belts(osc)]
@@ -78,22 +78,22 @@ def border_at(
 ) -> list[SpecialPoint]:
     """The border that a forced motion meets on a curve where its signature changes.
 
-    trail: up to a point beside; beyond: the point with which the curve goes on; centre, error:
-    where it changes, and how well that is known.
+    trail: up to a point beside the change; beyond: the point with which the curve goes on; centre,
+    error: place of the change, and how well it is known.
     """
     if not isinstance(condition, AbstractForcedCondition):
         return []
     osc = trail.variation.oscillator(trail.values[-1])
     motion = trail.system.motion(osc, trail.x)
     if of_one_loop(motion.signature) == of_one_loop(beyond.cycle.signature):
-        return []  # an event passes the phase 0
+        return []  # only the first event differs: one passes the phase 0
     distances = {}
     for border in borders_of(osc):
         timed = border.with_clock()
         if timed.lineage != condition.lineage:
             some = timed.beginnings_of(osc, motion)
             distances[border] = min((float(one.distance) for one in some), default=np.inf)
-    # What holds here, some part of a step before, holds all along the curve.
+    # A condition that holds here already, some part of a step before, holds all along the curve.
     near = [border for border, away in distances.items() if HOLDS < away <= trail.step]
     if not near:
         return []
@@ -105,8 +105,8 @@ def border_at(
 def _zeros_along(
     trail: Trail, condition: AbstractForcedCondition, motion: PeriodicMotion, kind: str
 ) -> Iterator[SpecialPoint]:
-    """Special points of a kind on the curves of a condition that are found from a motion, near the
-    last row, and where the motion is about the same."""
+    """Special points of a kind, near the last row, on the curves of a condition through the points
+    that are found from a motion, where the motion is about the same."""
     anywhere, place = np.array([[-np.inf, np.inf]] * 2), place_of_motion(motion)
     for point, values in _points_near(trail, condition, motion):
         track, u = Track.begun(trail.variation, point, values)
@@ -133,7 +133,7 @@ def _zeros_along(
 def _points_near(
     trail: Trail, condition: AbstractForcedCondition, motion: PeriodicMotion
 ) -> Iterator[tuple[BifurcationPoint, np.ndarray]]:
-    """Points of a condition with one of the parameters of the last row, and both parameters."""
+    """A point of a condition with one parameter as in the last row, and both its parameters."""
     last = trail.values[-1]
     for free in (0, 1):
         along = trail.variation.held(1 - free, float(last[1 - free]))

@@ -26,19 +26,19 @@ from ..numerics.compiling import each, jit
 from ..results import Status
 from .systems import third_derivative
 
-#: Arcs for which the orbit from slip onset is followed in search of the signature. Of 665 such
-#: orbits (300 oscillators, half of them of round numbers) 84% repeated by then, 87% after 96.
+#: Number of arcs for which the orbit from slip onset is followed to find the signature. Of 665 such
+#: orbits (300 oscillators, half of them with round numbers) 84% repeated by then, 87% after 96.
 HINT_BUDGET = 32
-#: Arcs for which each orbit is followed that may lead to a cycle, and how often it is followed on,
-#: or from its limit, until it repeats. Of the 1,565 orbits from `starts` of those oscillators 87%
+#: FOLLOWED arcs in each of ATTEMPTS attempts to follow an orbit until it repeats; each continues
+#: the orbit or begins at its limit. Of the 1,565 orbits from `starts` of those oscillators 87%
 #: repeated within 96 arcs, 95% within 384 and 97% within 768; the others creep.
 FOLLOWED = 96
 ATTEMPTS = 6
-#: Distances of starts to the right of an equilibrium. One more, INNERMOST, is used if the
-#: equilibrium repels: within an unstable cycle around it there may be one that attracts.
+#: Distances of the starts to the right of an equilibrium. If it repels, INNERMOST is one more: an
+#: unstable cycle may surround it, with an attracting cycle between the two.
 DISTANCES, INNERMOST = (0.02, 0.3, 3.0), 4e-3
-#: Distance of starts beside a saddle: a cycle that attracts may pass it as closely, soon after a
-#: connection.
+#: Distance of the starts on both sides of a saddle: just beyond a saddle connection an attracting
+#: cycle may pass the saddle this closely.
 BESIDE_SADDLE = 1e-9
 
 
@@ -46,7 +46,7 @@ def starts(osc: Oscillator, rests: Equilibria) -> Array:
     """Starts of the orbits that find the cycles, [starts, 2].
 
     They lie at ends of stick phases, just beside the saddles, and at several distances from an
-    equilibrium, the farthest one last. NaN: no such start.
+    equilibrium, the farthest one last. Rows without a start are NaN.
     """
     exists = rests.kind > 0
     repels = exists & ~rests.stable
@@ -66,9 +66,9 @@ def starts(osc: Oscillator, rests: Equilibria) -> Array:
 def _innermost(osc: Oscillator, rests: Equilibria, row: Array) -> Array:
     """Distance of the innermost start from an equilibrium that repels.
 
-    Beside a supercritical Hopf point the cycle is there, to third order: its damping over a loop,
-    rate A^2 + y A^4 / 16 with the third derivative y of x2' by x2, is zero. Orbits would hardly
-    come to so weak a cycle, and it may end in a fold before they do.
+    Beside a supercritical Hopf point it is the amplitude A of the cycle, to third order: the growth
+    over a loop, rate A^2 + y A^4 / 16 with y the third derivative of x2' by x2, is zero there. From
+    other starts orbits hardly converge to so weak a cycle, which may end in a fold before they do.
     """
     codes = rests.modes[row].astype(float)
     third = third_derivative(osc, codes, rests.x1[row])
@@ -80,11 +80,11 @@ def _innermost(osc: Oscillator, rests: Equilibria, row: Array) -> Array:
 def approach(osc: Oscillator, rests: Equilibria, start: Array, stride: float | Array) -> Orbit:
     """Follows the orbit from a start until it repeats; the status is OK where it is on a cycle.
 
-    An orbit that does not repeat is followed on, from its limit where that is known: if the
-    differences of the last three tops form a geometric sequence, Aitken's formula gives it. If the
-    limit is much nearer to the last top than that is to any equilibrium, the orbit from there is
-    followed next, as there may be a boundary on the way. If that does not repeat either, its last
-    loop counts as the one that repeats. An orbit whose last loop sticks is followed on instead:
+    An orbit that has not repeated is continued in a further attempt. Aitken's formula, exact for a
+    geometric sequence, gives the limit of the last three tops (maxima of x1). If the limit is much
+    nearer to the last top than any equilibrium is, the next attempt begins at the limit, as there
+    may be a boundary on the way; if the last attempt does not repeat either, its last loop counts
+    as the one that repeats. An orbit whose last loop sticks is always continued from where it is:
     from the end of the stick phase it repeats exactly.
     """
 
@@ -123,7 +123,7 @@ def approach(osc: Oscillator, rests: Equilibria, start: Array, stride: float | A
 
 
 def _zeros_of(function: Callable, argument: Any) -> Any:
-    """Zeros in place of what a function gives."""
+    """Zeros with the shapes and dtypes of function(argument)."""
     shapes = jax.eval_shape(function, argument)
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
@@ -132,7 +132,7 @@ def _zeros_of(function: Callable, argument: Any) -> Any:
 def repeated_loops(
     osc: Oscillator, rests: Equilibria, size: int, stride: float | Array = STRIDE
 ) -> tuple[Loop, Array]:
-    """The loops that the orbits from `starts` repeat, in `size` arcs each, and their status."""
+    """The loop that each orbit from `starts` repeats, padded to `size` arcs, and its status."""
 
     def run(start):
         orbit = approach(osc, rests, start, stride)
@@ -145,8 +145,8 @@ def repeated_loops(
 
 
 def nearest(osc: Oscillator, size: int, condition: Any) -> tuple[Loop, Array]:
-    """The attracting cycle, in `size` arcs, with the least condition.distance(osc, loop), and a
-    status."""
+    """The loop, padded to `size` arcs, of the attracting cycle with the least
+    condition.distance(osc, loop), and a status."""
     return _least_distant(osc, *repeated_loops(osc, candidates(osc), size), condition)
 
 
@@ -162,10 +162,10 @@ def _least_distant(osc: Oscillator, loops: Loop, status: Array, condition: Any):
 
 
 def least_push(osc: Oscillator, loop: Loop, belt: int | Array) -> tuple[Array, Array]:
-    """The arc that arrives to stick to a belt with the least x2': its row, and the size of that.
+    """Row of the arc that arrives to stick to a belt with the least |x2'|, and that |x2'|.
 
-    From the side on which x2' vanishes where the orbit is tangent to the boundary; inf: there is
-    none.
+    Only arcs that slip with the sign of the belt's velocity count: on that side x2' vanishes where
+    an orbit is tangent to the boundary. Without such an arc |x2'| is inf.
     """
     side = jnp.sign(velocity_of(osc, belt))
     arrives = loop.used & (following_codes(loop)[:, belt] == 0) & (loop.codes[:, belt] == side)
@@ -179,11 +179,12 @@ def least_push(osc: Oscillator, loop: Loop, belt: int | Array) -> tuple[Array, A
 
 @jit
 def orbit_after_stick(osc: Oscillator, belt: int | Array) -> tuple[Oscillator, Array, Orbit]:
-    """The orbit from the end of a stick phase on a belt, its start, and the oscillator.
+    """The oscillator, a state just before a stick phase on the belt ends, and the orbit from there.
 
-    Of several orbits the one that comes back most nearly tangent to its boundary to stick there; if
-    none does, the one that comes nearest to it. The oscillator is the given one except for the
-    velocity of that belt: if it is at rest, no orbit leaves, and it gets a small velocity.
+    There is such an orbit in each of several zones: the one that returns to stick to the belt most
+    nearly tangent to the boundary is taken; if none sticks, the one that comes nearest to the
+    boundary. The oscillator is the given one, but a belt at rest gets a small velocity, as no orbit
+    leaves it.
     """
     velocities = [
         jnp.where((belt == i) & (one.velocity == 0), 1e-2, one.velocity)
@@ -220,7 +221,7 @@ def orbit_after_stick(osc: Oscillator, belt: int | Array) -> tuple[Oscillator, A
 
 @jit
 def repeated_loop(orbit: Orbit, size: int, n: int) -> tuple[Loop, Array]:
-    """The loop that an orbit repeats, and a status."""
+    """The loop that an orbit repeats, padded to `size` arcs, and a status; n: number of belts."""
     _, count = last_loop(orbit)
     status = jnp.where(count <= size, Status.OK.value, Status.TOO_MANY_ARCS.value)
     status = jnp.where(orbit.status == Status.OK, status, Status.NOT_TOUCHED.value)
@@ -228,7 +229,7 @@ def repeated_loop(orbit: Orbit, size: int, n: int) -> tuple[Loop, Array]:
 
 
 def without_arcs(loop: Loop, row: Array, removed: Array) -> tuple[Loop, Array]:
-    """The loop without `removed` arcs after a row; and that row, which is then its last one."""
+    """The loop without the `removed` arcs after `row`, and the new number of `row`, its last."""
     rows, count = jnp.arange(loop.ends.size), jnp.maximum(jnp.sum(loop.used), 1)
     left, first = count - removed, row + removed + 1
     source = jnp.where(rows < left, first + rows, first) % count

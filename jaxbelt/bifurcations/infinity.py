@@ -21,7 +21,7 @@ from .systems import RestSystem
 
 
 class FarOut(RestSystem):
-    """Loops far out neither grow nor shrink; nothing else is unknown."""
+    """Loops far out neither grow nor shrink: one equation, in the parameter alone."""
 
     @property
     def otherwise(self):
@@ -31,16 +31,16 @@ class FarOut(RestSystem):
         return contraction_far_out(osc)[None]
 
     def exists(self, osc, x):
-        # Without any friction each loop is a cycle.
+        # Without any friction every loop is a cycle, and none comes from infinity.
         rubs = any_of([belt.load * belt.friction.static > 0 for belt in osc.belts])
         return rubs & jnp.all(jnp.stack([has_limit(belt.friction) for belt in osc.belts]))
 
 
 class HopfAtInfinity(AbstractRestCondition):
-    """An unstable cycle around everything else comes from infinity, mostly where the damping is
+    """An unstable cycle around all other motions comes from infinity, mostly where the damping is
     zero.
 
-    Beyond, with less damping, motions from outside of it grow beyond all bounds.
+    On the side of less damping, motions that start outside of it grow beyond all bounds.
     """
 
     caption: ClassVar[str] = "Hopf at infinity"

@@ -16,9 +16,9 @@ class Label(NamedTuple):
     """The motions at one value of the parameter.
 
     Attributes:
-        equilibria: (kind, stable, contact codes), from left to right.
-        cycles: Itineraries of the attracting cycles, in order.
-        marks: Marks of further conditions that `scan` looks for.
+        equilibria: (kind, stable, contact codes) of each equilibrium, from left to right.
+        cycles: Itineraries of the attracting cycles, sorted.
+        marks: `AbstractCondition.mark` of each of the user's own conditions.
         courses: Courses of the orbits that leave saddles of contact edges, see `connections`.
         bounded: Whether loops far out shrink, see `infinity`.
     """
@@ -32,34 +32,34 @@ class Label(NamedTuple):
     def is_as(self, other: "Label") -> bool:
         """Whether two labels are the same.
 
-        Courses are compared only if there are as many saddles: a new saddle shows in the
-        equilibria, and exactly there it does not exist yet.
+        Courses are compared only if both labels have the same number of saddles: a saddle that
+        appears changes the equilibria, too, and at exactly that value it does not exist yet.
         """
         courses = other.courses if len(self.courses) == len(other.courses) else self.courses
         return self == other._replace(courses=courses)
 
     def events(self, kind: EventKind) -> Counter[int]:
-        """Number of events of a kind in the cycles, by belt."""
+        """Number of events of one kind in all cycles, by belt."""
         return Counter(belt for path in self.cycles for one, belt in events_of(path) if one == kind)
 
     @property
     def foci(self) -> int:
-        """Number of equilibria that attract, without segments."""
+        """Number of stable equilibria, segments not counted."""
         return sum(
             stable and kind != EquilibriumKind.SEGMENT for kind, stable, _ in self.equilibria
         )
 
     @property
     def smooth(self) -> int:
-        """Number of cycles that stick to no belt, without those that are only assumed."""
+        """Number of cycles that stick to no belt, not counting assumed ones (empty itineraries)."""
         return sum(bool(path) and not sticks(path) for path in self.cycles)
 
 
 class AttractingCycle(NamedTuple):
-    """An attracting cycle: its itinerary, and a loop of it, with room for more arcs.
+    """An attracting cycle: its itinerary, () if it is only assumed, and a loop of it, padded.
 
-    The loop of a cycle that does not stick solves the equations of the cycle, except where
-    `approach` did not find where the orbit repeats.
+    The loop of a cycle that does not stick solves the equations of the cycle. That of an assumed
+    cycle does not: it is the last loop of an orbit for which `approach` found no repetition.
     """
 
     path: Itinerary

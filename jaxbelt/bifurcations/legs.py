@@ -1,7 +1,7 @@
 """Legs of a branch of forced motions: motions with one signature along a parameter, `MotionLeg`.
 
 With a fixed signature a branch is a curve in the unknowns of its motions and the parameter, which
-pseudo-arclength follows, round folds, too; see `branches`.
+pseudo-arclength continuation follows, around folds too; see `branches`.
 """
 
 from typing import NamedTuple
@@ -26,20 +26,20 @@ from ..numerics.continuation import Corrected
 from .systems import WEIGHT
 from .tracks import corrected_among
 
-#: How far along a tangent the state at the phase 0 is compared.
+#: Length of the step along a tangent over which `_course` takes differences.
 SHORT_WAY = 1e-6
 
 
 class MotionRow(NamedTuple):
-    """A motion of a branch and where it is."""
+    """A motion of a branch and its value of the parameter."""
 
     value: float
     motion: PeriodicMotion
 
 
 class MotionBranch(NamedTuple):
-    """Motions along a branch, and values inside of the span at which it ends without a point; a
-    closed one comes back to its first motion."""
+    """Motions along a branch; open_ends: values inside of the span at which it ends without a
+    bifurcation point; is_closed: whether it comes back to its first motion."""
 
     rows: list[MotionRow]
     open_ends: list[float]
@@ -47,8 +47,8 @@ class MotionBranch(NamedTuple):
 
 
 class ForcedLine(NamedTuple):
-    """What is varied, between which values, whether its oscillators look the same from both sides,
-    see `symmetry`; and turns: see `TimedChain`."""
+    """The variation of a parameter from `first` to `last`; turns: see `TimedChain`; is_symmetric:
+    whether its oscillators look the same from both sides, see `symmetry`."""
 
     variation: Variation
     first: float
@@ -65,7 +65,7 @@ class ForcedLine(NamedTuple):
 
 
 class MotionLeg(NamedTuple):
-    """A fixed signature: its chain, and what the unknowns and the parameter are measured in."""
+    """Motions of one signature along a line: a curve u = (weights * unknowns, value / length)."""
 
     line: ForcedLine
     chain: TimedChain
@@ -80,14 +80,14 @@ class MotionLeg(NamedTuple):
 
     @classmethod
     def begun(cls, line: ForcedLine, row: MotionRow) -> tuple["MotionLeg", Corrected]:
-        """The leg of a row, and the unknowns and the tangent of the row, if they are found; its
-        chain begins off events."""
+        """The leg of a row, with a chain that begins off events, and u and the tangent at the row,
+        if Newton's method finds them."""
         motion = begun_off_events(line.at(row.value), row.motion)
         leg, u = cls.of(line, row._replace(motion=motion))
         return leg, leg.corrected(u, np.eye(u.size)[-1], 0.0)
 
     def corrected(self, u: np.ndarray, tangent: np.ndarray, length: float) -> Corrected:
-        """As `continuation.corrected`."""
+        """See `continuation.corrected`: the point of the leg `length` ahead of u."""
         units = np.array([self.line.length])
         args = self.chain, self.weights, jnp.asarray(units[0])
         given = _linearized_motion, args, units
@@ -101,9 +101,9 @@ class MotionLeg(NamedTuple):
     def going_on(
         self, row: MotionRow, u: np.ndarray, tangent: np.ndarray
     ) -> tuple["MotionLeg", np.ndarray, np.ndarray]:
-        """The leg in the sizes of a row of it, and with the row's steps of integration; the row's
-        unknowns, and the tangent, in these sizes. Where an event has come near to the phase at
-        which the chain begins, it begins at another one."""
+        """The leg with the weights and the integration steps of one of its rows, and u and the
+        tangent of the row in these weights. Where an event has come near to the phase at which the
+        chain begins, the chain is begun at another phase."""
         moved = row._replace(motion=begun_off_events(self.line.at(row.value), row.motion))
         if moved.motion is not row.motion:
             leg, begun = MotionLeg.begun(self.line, moved)
@@ -115,13 +115,13 @@ class MotionLeg(NamedTuple):
         return leg, u, tangent / np.linalg.norm(tangent)
 
     def _course(self, u: np.ndarray, tangent: np.ndarray) -> np.ndarray:
-        """How the state at the phase 0 and the parameter change along a tangent, wherever the chain
-        begins, [3]."""
+        """Change of the state at the phase 0 and of the parameter along a tangent, [3]; it does not
+        depend on the phase at which the chain begins."""
         ahead = u + SHORT_WAY * tangent
         return np.append(self.start(ahead) - self.start(u), ahead[-1] - u[-1])
 
     def start(self, u: np.ndarray) -> np.ndarray:
-        """The state at the phase 0, also of what is no motion."""
+        """The state at the phase 0, [2], even where u is not an admissible motion."""
         z = jnp.asarray(u[:-1] / np.asarray(self.weights)).reshape(-1, 4)
         return state_at_phase_0(self.line.at(float(self.line.length * u[-1])), self.chain, z)
 

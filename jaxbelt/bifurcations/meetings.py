@@ -1,17 +1,18 @@
 """Contact edges of two belts that meet: `EdgeExchange` and `MeetingEdges`.
 
 Beside such a point the two edges lie close together, and the contacts between them differ from
-those to the left and to the right of both. At the point there is nothing between; beyond, the edges
-come in the other order, and the contacts between them are different again.
+those to the left and to the right of both. At the point nothing is between them; beyond it the
+edges come in the other order, and the contacts between them are different again.
 
 - `EdgeExchange`: a cycle passes both edges, one right after the other. Its velocity is not zero
   there, so the arc between them has the duration distance/velocity. It vanishes at the point like
   the distance itself, and with the signature fixed the cycle goes smoothly through, as at a sliding
   exchange. The orbit changes continuously; its modes, and the order of its events, change at once.
-- `MeetingEdges`: the mass can rest there, whether a cycle passes or not. By the accelerations at
-  rest to the left of both edges, between them and to the right of both, there is a pseudo-focus on
-  one of the edges, a segment between them, or nothing. Beyond, the acceleration between them is
-  another one: the equilibrium may move to the other edge, change its stability, appear or vanish.
+- `MeetingEdges`: the mass can rest there, whether a cycle passes or not. The accelerations at rest
+  to the left of both edges, between them and to the right of both decide whether there is a
+  pseudo-focus on one of the edges, a segment between them, or no equilibrium. Beyond the point the
+  acceleration between them differs: the equilibrium may move to the other edge, change its
+  stability, appear or vanish.
 """
 
 from itertools import pairwise, product
@@ -45,13 +46,13 @@ class TwoEdges(eqx.Module):
     second: Array
 
     def gap(self, osc: Oscillator) -> Array:
-        """Distance of the first one to the right of the second one."""
+        """Position of the first edge minus that of the second one."""
         positions = jnp.stack(edges(osc))
         return positions[self.first] - positions[self.second]
 
 
 class _BetweenEdges(AbstractCondition):
-    """A condition on contact edges of two belts, of which any two may meet."""
+    """A condition that any contact edge of one belt meets any contact edge of another."""
 
     belts: tuple[int, int]
 
@@ -65,14 +66,14 @@ class _BetweenEdges(AbstractCondition):
 
 
 def _edge_pairs(osc: Oscillator, belts: tuple[int | Array, int | Array]) -> TwoEdges:
-    """The four pairs of an edge of one belt and one of the other, [4]."""
+    """The four pairs of an edge of the first belt and an edge of the second one, [4]."""
     n = len(osc.belts)
     pairs = [(belts[0] + i * n, belts[1] + j * n) for i, j in product((0, 1), repeat=2)]
     return TwoEdges(*(jnp.stack([jnp.asarray(one) for one in ends]) for ends in zip(*pairs)))
 
 
 def _size(gap: Array) -> Array:
-    """Size of a gap between edges, inf where one of them is infinite, or both are."""
+    """Absolute gap between two edges, inf where either edge is infinite."""
     return jnp.where(jnp.isfinite(gap), jnp.abs(gap), jnp.inf)
 
 
@@ -102,7 +103,7 @@ class EdgesPassed(CycleSystem):
 class EdgeExchange(AbstractCycleCondition, _BetweenEdges):
     """Contact edges of two belts meet and change places where a cycle passes them.
 
-    Beyond, it passes them in the other order; between them it slips, or sticks, otherwise.
+    Beyond the point it passes them in the other order, in another mode between them.
 
     Args:
         belts: Numbers of the two belts.
@@ -135,10 +136,10 @@ class EdgeExchange(AbstractCycleCondition, _BetweenEdges):
 
 
 def _passage_of_edges(osc: Oscillator, loop: Loop, belts) -> tuple[Array, Array, TwoEdges]:
-    """The place where a loop passes an edge of each belt in succession and these are nearest.
+    """The closest two edges, one of each belt, that a loop passes in succession.
 
-    Returns the distance of the edges, inf if there is no such place, the row that ends on the first
-    one, and the edges.
+    Returns the distance between them, inf if there are no such edges, the row of the arc that ends
+    on the edge that is passed first, and the pair.
     """
     n, positions, pairs = len(osc.belts), jnp.stack(edges(osc)), _edge_pairs(osc, belts)
     passes = (loop.ends >= n) & (loop.ends < 3 * n)
@@ -147,7 +148,7 @@ def _passage_of_edges(osc: Oscillator, loop: Loop, belts) -> tuple[Array, Array,
 
     def distances(pair):
         first, second = positions[pair.first], positions[pair.second]
-        # Where they are at one place both are passed at once.
+        # Two edges at one place are passed at once, at the end of one arc.
         then = jnp.where(first == second, at, following)
         passed = (at == first) & (then == second) | (at == second) & (then == first)
         return jnp.where(passed, _size(pair.gap(osc)), jnp.inf)
@@ -161,7 +162,7 @@ def _passage_of_edges(osc: Oscillator, loop: Loop, belts) -> tuple[Array, Array,
 
 
 class EdgesAtRest(RestSystem):
-    """Two edges meet, and nothing else is unknown; belts: those with these edges."""
+    """Two edges meet: one equation, in the parameter alone; belts: those with these edges."""
 
     pair: TwoEdges
     belts: tuple[int | Array, int | Array]
@@ -177,7 +178,7 @@ class EdgesAtRest(RestSystem):
         return edge_at(osc, self.pair.first)
 
     def exists(self, osc, x):
-        """Whether the mass can rest on, or between, them in either order."""
+        """Whether the mass can rest on the edges, or between them, in either order of the edges."""
         focus, held = self._margins(osc)
         rests = any_of([*(one > 0 for one in focus), *(one >= 0 for one in held)])
         return rests & _both_rub(osc, self.belts)
@@ -187,8 +188,8 @@ class EdgesAtRest(RestSystem):
         return {("BoundaryEquilibrium", ()): jnp.max(jnp.stack([*focus, *held]))}
 
     def _margins(self, osc: Oscillator) -> tuple[list[Array], list[Array]]:
-        """How hard the mass is pushed to a pseudo-focus on either edge, and how much more belts at
-        rest could hold between them, in both orders; negative where there is no such rest."""
+        """Margins of a pseudo-focus on either edge (the weaker push to it) and of a segment between
+        the edges (spare holding force), in both orders; negative where the mass cannot rest so."""
         positions = jnp.stack(edges(osc))
         ends = jnp.sort(jnp.stack([positions[self.pair.first], positions[self.pair.second]]))
         rest = jnp.zeros(())
@@ -197,8 +198,8 @@ class EdgesAtRest(RestSystem):
         focus, held = [], []
         passed_first = (self.belts[0], self.pair.first), (self.belts[1], self.pair.second)
         for (passed, edge), (other, _) in zip(passed_first, reversed(passed_first), strict=True):
-            # Between them the belt whose edge comes first has the contact that it has to the right
-            # of both, and so have equal ones.
+            # Between the edges the belt whose edge comes first already has its contact to the right
+            # of both, and so have belts that are equal to it.
             equal = _equal_belts(osc, passed, edge)
             codes = [
                 jnp.where(equal[number] & (number != other), after, before)
@@ -212,7 +213,7 @@ class EdgesAtRest(RestSystem):
 
 
 def _equal_belts(osc: Oscillator, belt: int | Array, edge: Array) -> list[Array]:
-    """Which belts have the velocity of one, and the edge of that number, on their same side."""
+    """Whether each belt has the velocity of `belt` and, on the same side, an edge at `edge`."""
     n, positions = len(osc.belts), jnp.stack(edges(osc))
     velocities = jnp.stack([jnp.asarray(one.velocity) for one in osc.belts])
     sides = positions.reshape(2, n)[edge // n]
@@ -221,7 +222,7 @@ def _equal_belts(osc: Oscillator, belt: int | Array, edge: Array) -> list[Array]
 
 
 def _net_pushes(osc: Oscillator, mode: Mode, x1: Array) -> tuple[Array, Array]:
-    """The forces on the mass at rest to the right and to the left, less what belts at rest hold."""
+    """Forces on the mass at rest to the right and to the left, less the capacity of stuck belts."""
     needed, held = mode_acceleration(osc, mode, x1, jnp.zeros(())), capacity(osc, mode)
     return needed - held, -needed - held
 
@@ -229,7 +230,7 @@ def _net_pushes(osc: Oscillator, mode: Mode, x1: Array) -> tuple[Array, Array]:
 class MeetingEdges(AbstractRestCondition, _BetweenEdges):
     """Contact edges of two belts meet and change places where the mass can rest.
 
-    Beyond, the equilibrium there has another kind or stability, or it appears or vanishes.
+    Beyond the point the equilibrium there has another kind or stability, or it appears or vanishes.
 
     Args:
         belts: Numbers of the two belts.

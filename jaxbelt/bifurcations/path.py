@@ -9,10 +9,10 @@ equilibria find the other cycles. One compiled program computes labels in batche
 Where contact edges have saddles a label also has the courses of the orbits that leave them, see
 `connections`.
 
-Between two values with one label nothing is assumed to happen if each cycle at one of them
-continues to one at the other. A cycle that sticks does so if both have one itinerary. Several
-cycles that do not stick may have the same one: each is followed to where its derivative by the
-parameter leads.
+Between two values with the same label nothing is assumed to happen if each cycle at one of them
+continues to a cycle at the other. A cycle that sticks does so if its itinerary occurs at both.
+Several cycles that do not stick may share an itinerary: each is followed to where its derivative by
+the parameter leads.
 """
 
 import functools
@@ -64,13 +64,13 @@ BATCH = 16
 ROOM = SIZES[1]
 #: Values closer than CLOSE * (unit + span) count as equal.
 CLOSE = 1e-6
-#: Fraction of a step along the path by which the derivative of a cycle is taken, but no less than
-#: CLOSE: a cycle that hardly attracts is known to 1e-5 of its size only.
+#: The derivative of a cycle by the parameter is a difference over this fraction of a step along the
+#: path, but no less than CLOSE: a cycle that hardly attracts is known to 1e-5 of its size only.
 DIFFERENCE = 1e-3
-#: Unstable cycles are searched at one in so many values of a stretch, and followed in between.
+#: Unstable cycles are searched at every eighth value of a stretch, and followed in between.
 FOLLOWED_VALUES = 8
-#: A cycle is at its expected place if it is no farther from there than this, relative to its size,
-#: or than a third of its expected move. Closer to a square root, intervals get smaller.
+#: A cycle is at its expected place if it is no farther from there, relative to its size, than this
+#: plus 0.3 of its expected move. Where a cycle moves like a square root, intervals get shorter.
 EXPECTED = 1e-3
 
 
@@ -80,7 +80,7 @@ class ParameterPath:
     def __init__(
         self, osc, where, span, conditions: Sequence[AbstractCondition] = (), *, basins: bool = True
     ):
-        #: Whether labels contain courses, which change basins only and nothing that attracts.
+        #: Whether labels contain courses and `bounded`; they affect basins, but no attractor.
         self.basins = basins
         first, last = as_span(osc, where, span)
         given = varied(osc, where, (first,))
@@ -88,7 +88,7 @@ class ParameterPath:
         at_first = given.oscillator(np.array([first]))
         require(is_concrete(at_first), "osc", known, "a traced one")
         conditions = check_conditions(conditions)
-        #: In own units, the parameter too, like everything that follows.
+        #: The variation in own units, those of the parameter included; so is all that follows.
         self.variation = given.over(first, last)
         #: The given oscillator, or the one at the first value.
         self.osc = osc if isinstance(osc, Oscillator) else at_first
@@ -100,30 +100,30 @@ class ParameterPath:
         self.first, self.last = first / measured, last / measured
         self.conditions = conditions
         self.length = self.last - self.first
-        #: Unit of the parameter.
+        #: Natural unit of the parameter, see `Family.units`.
         self.unit = float(self.variation.family(np.array([0.5 * (self.first + self.last)])).unit)
         (self.name,) = self.variation.names
         self.labels: dict[float, Label] = {}
         self.cycles: dict[float, list[AttractingCycle]] = {}
         self.unstable_cycles: dict[tuple[float, int], Cycle] = {}
-        #: How often Newton's method was begun for a point of it.
+        #: How often Newton's method was begun for a point on this path.
         self.attempts = 0
         self._searched: set[tuple[float, int]] = set()
-        # From one value to another: for each cycle that does not stick the one that it continues
-        # to, or None.
+        # By (value, other value): for the number of each cycle that does not stick the number of
+        # the cycle at the other value that it continues to, or None.
         self._goes_on: dict[tuple[float, float], dict[int, int | None]] = {}
-        # Whether there is one at a value.
+        # Whether a pseudo-focus exists, by the value.
         self._pseudo_foci: dict[float, bool] = {}
-        # Between which values labels are found by fine orbits.
+        # Intervals in which labels are computed by fine orbits, with the stride FINE_STRIDE.
         self._fine: list[tuple[float, float]] = []
         self._coincidences = self.variation.coincidences(self.first, self.last)
         self._meetings = self.variation.meetings(self.first, self.last)
         self.breaks = sorted(self._coincidences.keys() | self._meetings.keys())
 
     def inside(self, end: float) -> float:
-        """An end of the span, or a value beside it where a load vanishes at the end.
+        """An end of the span; where a load vanishes there, a value just inside of the span.
 
-        Labels name no belt without load, but nothing happens as the load vanishes.
+        Labels leave out belts without load, so the label at the end would differ for no reason.
         """
         middle = 0.5 * (self.first + self.last)
         here, there = ([float(b.load) for b in self.at(at).belts] for at in (end, middle))
@@ -137,25 +137,25 @@ class ParameterPath:
         return self._oscillators[value]
 
     def idle(self, value: float) -> np.ndarray:
-        """See `idle_belts`; known of a labelled value without its oscillator."""
+        """`idle_belts` at a value; labelled values need not make their oscillator for it."""
         if value not in self._idle:
             self._idle[value] = idle_belts(self.at(value))
         return self._idle[value]
 
     def unstable(self, value: float, around: int) -> Cycle:
-        """The unstable cycle at a value around an equilibrium, or why there is none; computed
-        once."""
+        """The unstable cycle at a value around an equilibrium, computed once; its status says why
+        there is none."""
         if (value, around) not in self.unstable_cycles:
             self.unstable_cycles[value, around] = from_starts(self.at(value), around=around)
         return self.unstable_cycles[value, around]
 
     def unstable_along(self, values: Sequence[float] | np.ndarray, around: int) -> list[Cycle]:
-        """Unstable cycles at values in order, between which nothing else happens.
+        """Unstable cycles at increasing values without other bifurcations between them.
 
         They are searched at some of the values, and followed from one of these to the next, where
-        the cycle has to be the one that is searched; else all are searched. Starts near the
-        equilibrium may lead to none, or pass over it to one farther out; there the cycles at
-        neighbouring values are continued.
+        the cycle has to agree with the one that the search finds; else every value is searched. The
+        search, from starts near the equilibrium, may find no cycle, or pass over it to one farther
+        out; there the cycles at neighbouring values are continued.
         """
         order = [float(value) for value in values]
         known = self.unstable_cycles
@@ -177,8 +177,8 @@ class ParameterPath:
         return [known[value, around] for value in order]
 
     def _follow_unstable(self, order: Sequence[float], around: int) -> None:
-        """Follows the unstable cycle from the first value to those before the last one, if it is
-        found there and leads to the one that is found at the last."""
+        """Follows the unstable cycle from the first value to the last one, and keeps the cycles in
+        between if it arrives at the cycle that is found at the last value."""
         cycle, end = (self.unstable(value, around) for value in (order[0], order[-1]))
         is_known = all((value, around) in self.unstable_cycles for value in order)
         if is_known or not (_is_found(cycle) and _is_found(end)):
@@ -194,7 +194,7 @@ class ParameterPath:
                 self.unstable_cycles.setdefault(key, one)
 
     def beside(self, value: float, *, slow: bool = False) -> tuple[float, float]:
-        """The values just below and just above; farther off where motions converge slowly."""
+        """Values just below and above `value`; slow: farther off, as motions converge slowly."""
         # Not closer in a short span: a loop counts as repeated when it repeats to 1e-7.
         distance = CLOSE * (self.unit + self.length)
         far = value - 30.0 * distance, value + 30.0 * distance
@@ -234,8 +234,8 @@ class ParameterPath:
         return belts
 
     def coinciding(self, value: float) -> list[tuple[int, ...]]:
-        """Pairs of belts that come to one velocity at a value, and single belts that come to
-        rest."""
+        """Pairs of belts whose velocities become equal at a value, and single belts that come to
+        rest there."""
         return self._coincidences.get(value, [])
 
     def meeting(self, value: float) -> list[tuple[int, ...]]:
@@ -256,7 +256,7 @@ class ParameterPath:
         """Computes all labels within `away` of a value again, by orbits that are accurate to 1e-12.
 
         Later labels there are computed in the same way. Where two events of a cycle come close
-        together the error of other orbits, some 1e-8, decides which is first.
+        together the error of ordinary orbits, some 1e-8, decides which event is first.
         """
         self._fine.append((value - away, value + away))
         again = [v for v in self.labels if abs(v - value) <= away]
@@ -270,7 +270,7 @@ class ParameterPath:
         return any(low <= value <= high for low, high in self._fine)
 
     def is_fine(self, a: float, b: float) -> bool:
-        """Whether labels are found by fine orbits at two values."""
+        """Whether the labels at both values are computed by fine orbits."""
         return self._is_fine(a) and self._is_fine(b)
 
     def _label_batch(self, batch: np.ndarray, stride: float) -> None:
@@ -283,7 +283,8 @@ class ParameterPath:
             self._take(value, idle, one, course)
 
     def changes(self, explained: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-        """Intervals between labelled values that differ, without those that are explained."""
+        """Intervals between neighbouring labelled values whose motions differ, except those inside
+        of an explained interval."""
         return [
             (a, b)
             for a, b in pairwise(sorted(self.labels))
@@ -294,11 +295,11 @@ class ParameterPath:
     def _take(
         self, value: float, idle: np.ndarray, seen: "_Motions", courses: tuple[SaddleCourse, ...]
     ) -> None:
-        """Labels a value by what was seen there; idle: see `idle_belts`."""
+        """Stores the label and the cycles of a value from its motions; idle: see `idle_belts`."""
         self._idle[value] = idle
         exists = seen.kind > 0
         codes = without_idle(idle, seen.modes[exists])
-        # The direction in which belts rub at a pseudo-focus makes no difference.
+        # The sign of slip at a pseudo-focus makes no difference: a label always has 1.
         is_focus = seen.kind[exists, None] == EquilibriumKind.PSEUDO_FOCUS
         codes = np.where(is_focus & (codes == -1), 1, codes)
         columns = (seen.kind, seen.stable, seen.x1_lower, seen.x1_upper)
@@ -321,7 +322,7 @@ class ParameterPath:
         self._name(value)
 
     def _name(self, value: float) -> None:
-        """The label at a value with its cycles."""
+        """Updates the cycles and the marks in the label at a value."""
         cycles = sorted(self.cycles[value], key=lambda one: one.path)
         loops = [one.loop for one in cycles if one.path]
         marks = tuple(condition.mark(self.at(value), loops) for condition in self.conditions)
@@ -331,16 +332,16 @@ class ParameterPath:
     def _attracting_cycle(
         self, value: float, loop: Loop, *, closes: bool = True
     ) -> AttractingCycle | None:
-        """The attracting cycle near a loop, or the one that it leads to, or None.
+        """The attracting cycle near a loop, or the one that the orbit from there leads to, or None.
 
-        A loop that sticks is one of it. Any other may only seem to repeat. closes: whether it is
-        known to be one loop.
+        A loop that closes and sticks is a loop of the cycle itself. Any other may only seem to
+        repeat, so the cycle is solved for. closes: whether an orbit was seen to repeat the loop.
         """
         if closes and sticks(path := itinerary(self.idle(value), loop)):
             return AttractingCycle(path, loop)
         osc, ok = self.at(value), jnp.asarray(Status.OK.value)
-        # Where the cycle has other loops than those from which it is solved for, or meets a
-        # boundary, it is followed.
+        # Where the cycle has another signature than the loop, or meets a boundary, Newton's method
+        # fails, and the orbit is followed.
         ways = (lambda: polish(osc, cut([loop])[0], ok), lambda: cycle_from(osc, loop.entries[0]))
         for cycle in (way() for way in ways[0 if closes else 1 :]):
             if int(cycle.status) == Status.OK and abs(float(cycle.multiplier)) < 1:
@@ -352,8 +353,8 @@ class ParameterPath:
     def _agree_on_moments(self) -> None:
         """Makes neighbouring labels agree on arcs that take hardly any time.
 
-        Such an arc counts where it does at the value beside. It vanishes at a point that may be
-        some way off, not where its duration falls below `MOMENT`.
+        Such an arc counts if it does at the neighbouring value: it vanishes at a bifurcation point
+        that may be some way off, not where its duration falls below `MOMENT`.
         """
         values = sorted(self.labels)
         for pairs in (pairwise(values), pairwise(values[::-1])):
@@ -368,10 +369,10 @@ class ParameterPath:
                             self._name(b)
 
     def _share(self) -> None:
-        """Adds attracting cycles that a neighbouring value has.
+        """Adds attracting cycles that were found at a neighbouring value only.
 
-        A cycle that sticks is always reached, from the end of its stick phase. Another cycle may be
-        missed.
+        A cycle that sticks is always found, from the end of its stick phase. A cycle that does not
+        stick may be missed.
         """
         values = sorted(self.labels)
         for pairs in (pairwise(values), pairwise(values[::-1])):
@@ -383,8 +384,8 @@ class ParameterPath:
                         known[i] = self._followed(a, b, i)
 
     def _all_go_on(self, a: float, b: float) -> bool:
-        """Whether the cycles at one value that do not stick continue to those at another, one to
-        one."""
+        """Whether each cycle at `a` that does not stick continues to a cycle at `b`, and no two of
+        them to the same one."""
         ahead = self._goes_on[a, b] | {
             i: j for j, i in self._goes_on[b, a].items() if i is not None
         }
@@ -393,9 +394,9 @@ class ParameterPath:
         return len(set(reached)) == len(smooth) and all(ahead.get(i) is not None for i in smooth)
 
     def _followed(self, known: float, value: float, number: int) -> int | None:
-        """Number of the cycle at one value to which one at another value continues, or None.
+        """Number of the cycle at `value` that cycle `number` at `known` continues to, or None.
 
-        It is searched at the expected place, from the derivative.
+        The cycle is solved for from its expected place, which the derivative gives.
         """
         path, loop = self.cycles[known][number]
         step = value - known
@@ -423,9 +424,9 @@ class ParameterPath:
         return at
 
     def strands(self, values: Sequence[float]) -> list[dict[float, Loop]]:
-        """The attracting cycles at these values, in order, in which nothing else happens.
+        """Loops of the attracting cycles, by the value, for each cycle that continues.
 
-        For each cycle that continues from value to value its loops, by the value.
+        values: increasing, without bifurcations between them.
         """
         strands: list[dict[float, Loop]] = []
         sticking: dict[Itinerary, dict[float, Loop]] = {}
@@ -447,7 +448,7 @@ class ParameterPath:
         return [strand for strand in strands if strand]
 
     def _origin(self, before: float | None, value: float, number: int) -> int | None:
-        """Number of the cycle at the value before that continues to one that does not stick."""
+        """Number of the cycle at the value before that continues to the smooth cycle `number`."""
         if before is None:
             return None
         back = self._goes_on[value, before].get(number)
@@ -466,7 +467,7 @@ def _joined_rests(rows: Iterable[tuple]) -> tuple[tuple, ...]:
     edge of a belt without load, becomes one.
     """
     rests: list[tuple] = []
-    end = np.nan  # of the last one, if that is a segment
+    end = np.nan  # x1_upper of the last row, if that is a segment
     for kind, attracts, low, high, code in rows:
         if kind == EquilibriumKind.SEGMENT and low == end and rests[-1][2] == code:
             attracts |= rests.pop()[1]
@@ -480,13 +481,13 @@ def _is_found(cycle: Cycle) -> bool:
 
 
 def _gone_on(osc: Oscillator, beside: Cycle) -> Cycle | None:
-    """The cycle that an unstable cycle at a neighbouring value continues to."""
+    """The cycle that an unstable cycle at a neighbouring value continues to, or None."""
     cycle = solved(osc, jax.tree.map(np.asarray, as_loop(beside, ROOM)))
     return cycle if _is_beside(beside, cycle) and float(cycle.multiplier) > 1 else None
 
 
 def _is_beside(cycle: Cycle, other: Cycle) -> bool:
-    """Whether another cycle is found, and so near that one goes on to the other."""
+    """Whether `other` has been found, so near that `cycle` continues to it."""
     return _is_found(other) and bool(distance(place_of(cycle), place_of(other)) < GOES_ON)
 
 
@@ -495,9 +496,10 @@ def _width(cycle: Cycle) -> float:
 
 
 def _is_off_rest(cycle: Cycle) -> bool:
-    """Whether a cycle is not an equilibrium, to which it may shrink.
+    """Whether a cycle has not shrunk to an equilibrium.
 
-    Around a pseudo-focus its width is like its velocity squared: the larger of them is its size.
+    Its size is the larger one of its ranges of x1 and of x2: around a pseudo-focus the range of x1
+    is proportional to the square of that of x2.
     """
     return float(np.max(np.ptp(np.asarray(cycle.unknowns)[:, :2], axis=0))) > AT_REST
 
@@ -505,8 +507,8 @@ def _is_off_rest(cycle: Cycle) -> bool:
 def _number_among(cycle: AttractingCycle, among: Sequence[AttractingCycle]) -> int | None:
     """Number of a cycle among others, or None.
 
-    Two at the same place are one, whatever their modes: just before a corner that a cycle passes
-    with a short stick phase, a loop without it solves the equations to their accuracy, too.
+    Two cycles at the same place are one, whatever their modes: just before a corner that the cycle
+    passes with a short stick phase, a loop without that phase solves the equations within errors.
     """
     place = place_of(cycle.loop)
     for number, other in enumerate(among):
@@ -525,8 +527,8 @@ def _fits(loop: Loop, other: Loop) -> bool:
 
 
 class _Motions(NamedTuple):
-    """Equilibria, [rows], for every orbit its status and last loop, [starts, ROOM], and whether
-    loops far out shrink."""
+    """Columns of the equilibria, [rows]; status, [starts], and last loop, [starts, ROOM], of every
+    orbit; bounded: whether loops far out shrink."""
 
     kind: Any
     stable: Any

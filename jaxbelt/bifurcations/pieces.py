@@ -27,7 +27,7 @@ from .base import BifurcationPoint
 from .labels import Label
 from .path import ParameterPath
 
-#: Smallest size by which distances between ends of branches are measured.
+#: Distances between ends of branches are relative to the size of the motion, or to this if larger.
 LEAST_SIZE = 0.1
 
 
@@ -39,8 +39,8 @@ class Branch(eqx.Module):
         kind: "equilibrium" or "cycle".
         values: Values of the parameter, [rows]; they turn back at a fold.
         stable: Stability, [rows].
-        neutral: Whether it is a centre, see `Equilibria`, [rows]; no cycle is.
-        x1_min: Smallest x1 of the motion, [rows]; for a segment of pseudo-equilibria its end.
+        neutral: Whether it is a centre, see `Equilibria`, [rows]; False for cycles.
+        x1_min: Smallest x1 of the motion, [rows]; for a segment of pseudo-equilibria its lower end.
         x1_max: Largest x1, likewise.
         x2_min: Smallest x2, likewise.
         x2_max: Largest x2, likewise.
@@ -76,7 +76,7 @@ class Branch(eqx.Module):
     def evaluated(self, functional: Callable[[Cycle], Any]) -> np.ndarray:
         """Values of a functional of the cycles, [rows], NaN where there is none.
 
-        The functional gets one known `Cycle` after another, so JAX need not be able to trace it.
+        The functional gets one concrete `Cycle` after another, so JAX need not be able to trace it.
         """
         if not self.cycles:
             return np.full(len(self), np.nan)
@@ -97,7 +97,7 @@ class Branch(eqx.Module):
             "type": [""] * len(self),
             "value": self.values,
             **{name: getattr(self, name) for name in (*names, "multiplier")},
-            # Where a stick phase vanishes Newton's method leaves a rounding error of it.
+            # Where a stick phase vanishes Newton's method leaves rounding, which may be negative.
             **per_belt("stick_duration", np.maximum(self.stick_durations, 0.0)),
             "signature": events or [""] * len(self),
         }
@@ -113,7 +113,7 @@ class Branch(eqx.Module):
 
 
 def nodes_of_stretch(path: ParameterPath, a: float, b: float, rows: int) -> np.ndarray:
-    """Values from a to b, dense at both ends, which are left out where they are special."""
+    """Values from a to b, denser at both ends; special values give way to the ones beside them."""
     # Short stretches are no less curved than long ones: with fewer rows corners would be visible.
     count = max(9, rows // 9, round(rows * (b - a) / path.length))
     inner = 0.5 * (1 - np.cos(np.linspace(0, np.pi, count)))
@@ -123,9 +123,9 @@ def nodes_of_stretch(path: ParameterPath, a: float, b: float, rows: int) -> np.n
 
 
 def separated_stretches(labels: Sequence[Label]) -> list[tuple[int, int]]:
-    """Stretches with unstable cycles between equilibria and cycles that attract.
+    """Where unstable cycles may separate stable equilibria from attracting cycles.
 
-    With the number of each such equilibrium.
+    Returns a list of (number of the stretch, number of the equilibrium, segments not counted).
     """
     return [
         (stretch, around)
@@ -143,7 +143,7 @@ class _Piece(NamedTuple):
 
 
 def equilibrium_pieces(path: ParameterPath, nodes: Sequence[np.ndarray]) -> list[_Piece]:
-    """Those of equilibria, at the values of each stretch."""
+    """The pieces of equilibria; nodes: the values of each stretch."""
     found = _stacked(candidates, map(path.at, np.concatenate(nodes)))
     pieces = []
     for stretch, rows in enumerate(_consecutive(nodes)):
@@ -173,7 +173,8 @@ def equilibrium_pieces(path: ParameterPath, nodes: Sequence[np.ndarray]) -> list
 def cycle_pieces(
     path: ParameterPath, nodes: Sequence[np.ndarray], labels: Sequence[Label]
 ) -> list[_Piece]:
-    """Those of cycles, attracting and unstable, at the values of each stretch; labels: of these."""
+    """The pieces of cycles, attracting and unstable; nodes: values of each stretch; labels: a label
+    of each."""
     wanted: list[tuple[int, np.ndarray, list[Loop]]] = []
     for stretch in range(len(labels)):
         for loops in path.strands(nodes[stretch].tolist()):
@@ -228,7 +229,7 @@ def _row_of_branch(cycle: Cycle) -> dict[str, Array]:
 
 
 def _consecutive(groups: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Row numbers of each group, when all groups stand one after another."""
+    """Row numbers of each group in the concatenation of all groups."""
     ends = np.cumsum([len(group) for group in groups])
     return [np.arange(end - len(group), end) for group, end in zip(groups, ends, strict=True)]
 
@@ -236,7 +237,7 @@ def _consecutive(groups: Sequence[np.ndarray]) -> list[np.ndarray]:
 def _stacked(program, items: Iterable[Any]) -> Any:
     """Results of a program for each item, as NumPy arrays of many rows.
 
-    One by one, so that one program serves any number of them.
+    The items are computed one by one, so that one compiled program serves any number of them.
     """
     rows = [jax.tree.map(np.asarray, program(item)) for item in items]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
@@ -247,7 +248,7 @@ def _attracting(path: ParameterPath, values: np.ndarray, loops: Sequence[Loop]) 
 
     def solved(osc: Oscillator, loop: Loop) -> Cycle:
         cycle = polish(osc, loop, ok)
-        # The steps are too long for the law; a branch must not end for that.
+        # The integration steps are too long for the law; a branch must not end for that.
         return exactly(osc, loop, ok) if int(cycle.status) == Status.NO_CONVERGENCE else cycle
 
     pairs = zip(values, cut(loops), strict=True)
@@ -267,8 +268,8 @@ def joined_pieces(
 ) -> list[Branch]:
     """Joins pieces to branches.
 
-    special: the points between stretches, those at one value together. Two ends of pieces at the
-    same place there belong together.
+    special: the points between neighbouring stretches, a list for each value. Two ends of pieces
+    that have the same place at such a value are joined.
     """
     partner: dict[tuple[int, bool], tuple[int, bool]] = {}
     for at, points in enumerate(special):
@@ -309,7 +310,7 @@ def _end(number: int, piece: _Piece, *, right: bool) -> _End:
 
 
 def _between(a: _End, b: _End) -> float:
-    """How far apart two ends are, relative to the motion there."""
+    """Distance of two ends relative to the motion; inf between an equilibrium and a cycle."""
     (kind, *x), (other, *y) = a.place, b.place
     return distance(x, y, least=LEAST_SIZE) if kind == other else np.inf
 

@@ -1,6 +1,6 @@
 """Bifurcation points near a guess: `refine`.
 
-By Newton's method from the guess. If that fails, or ends far away, the point is bracketed: the
+Newton's method starts from the guess. If it fails, or ends far away, the point is bracketed: the
 search of `scan` is done on small intervals around the guess, from short to long.
 """
 
@@ -35,18 +35,18 @@ from .forced import forced_point
 from .path import ParameterPath
 from .scan import MOST_ATTEMPTS, more_exact, search
 
-#: Points found in two ways count as one if they are no farther apart.
+#: Points found in two ways count as one if their values differ by no more than this.
 SAME_POINT = 1e-9
 #: If Newton's method ends this near to the guess after a first step that is no longer than
-#: SHORT_STEP, no nearer point is searched. Of three thousand guesses four led beyond the next
-#: point, to others 0.008, 0.018 and 0.029 away, after first steps of 0.4 and 0.5, and to a corner
-#: 0.004 away beside another one.
+#: SHORT_STEP, no nearer point is searched. Of three thousand guesses four led past the nearest
+#: point to another one: 0.008, 0.018 and 0.029 away, after first steps of 0.4 and 0.5, and to a
+#: corner 0.004 away beside another one.
 QUITE_NEAR, SHORT_STEP = 0.05, 0.25
-#: The same after a longer step, and for conditions of which there may be several points beside each
-#: other: one fold of cycles was passed for another one 5e-4 farther off.
+#: The limit in place of QUITE_NEAR after a longer first step, and for conditions that may have
+#: several points close together: one fold of cycles was passed for another one 5e-4 farther off.
 BESIDE_OTHERS = 1e-4
-#: Reaches of the search on both sides of the guess, in order, and its number of intervals. All of
-#: these in units of the parameter, see `Family.unit`.
+#: Reaches of the search on both sides of the guess, in order, and its number of intervals. All
+#: distances here and above are in units of the parameter, see `Family.unit`.
 REACHES, INTERVALS = (2e-3, 1.2e-2, 5e-2, 0.2), 15
 
 
@@ -95,8 +95,8 @@ def refine(
         at: With a function: the value of the parameter to begin from.
         max_arcs: Room for the arcs of one loop (default 16; 32 where edges are passed).
         start: For a forced oscillator only: the motion to begin from, or a start (x1, x2) at t = 0
-            that leads to it; None: motions to which some starts lead, and of those with an even
-            number of periods the one that they may have left.
+            that leads to it; None: the motions to which some starts lead. Of a motion with an even
+            number of periods the motion with half as many, which it may have left, is tried, too.
 
     Returns:
         The `BifurcationPoint`. Without a point near the guess its status says why, and its value is
@@ -114,7 +114,8 @@ def refine(
         hint = "points of forced oscillators are not for jit or vmap"
         require_outside_of_jit("refine", hint, osc=osc, at=at, start=start)
         return given_point(forced_point(condition, variation, value, start), variation)
-    # Points of cycles take long to compile, and many of them are bracketed afterwards.
+    # Points of cycles take long to compile, and many are bracketed afterwards: both programs are
+    # compiled side by side.
     of_cycle = isinstance(condition, AbstractCycleCondition)
     ahead = [partial(_label_near, condition, variation, value)] if of_cycle else []
     with compiled_beside("refine", (condition, near, value), ahead):
@@ -142,14 +143,14 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
         path = _path_near(condition, variation, guess, min(reach, away))
         if path is None:
             break
-        # From farther off than in `scan`, as these paths are short.
+        # near=1.0: points are solved for from any interval, as these paths are short.
         path.attempts = attempts
         searched = search(path, INTERVALS, near=1.0, known=unexplained)
         attempts = path.attempts
         unexplained += [one for one in searched if int(one.status) == Status.UNEXPLAINED]
         found = [one for one in searched if int(one.status) == Status.OK]
-        # The search may report a point as one of another kind, too; or two are so near to each
-        # other that it reports one of them; or it is of one of two belts with one velocity.
+        # The search may report the point as one of another kind, or of the other one of two belts
+        # with one velocity, or only one of two points that are close together.
         values = [
             float(one.value)
             for one in found
@@ -160,7 +161,7 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
         within = (value for value in values if path.first <= value <= path.last)
         also = (condition.named_point_from(variation, value) for value in within)
         found += [one for one in also if one is not None]
-        # Any of these may have led to a point that is farther away than others beyond the reach.
+        # A point beyond the reach does not count: others, not searched yet, may be nearer.
         of_kind = [one for one in found if condition.covers(one) and _away(one, guess) <= reach]
         if of_kind:
             nearest = min(of_kind, key=lambda one: _away(one, guess))
@@ -178,8 +179,8 @@ def _bracketed(point: BifurcationPoint, variation: Variation, value: Any) -> Bif
 def points_within(
     condition: AbstractCondition, variation: Variation, guess: float, reach: float
 ) -> list[BifurcationPoint]:
-    """The points of that kind that the search of `scan` finds up to `reach` on both sides of a
-    guess; without forcing."""
+    """The points of the condition that the search of `scan` finds up to `reach` on both sides of a
+    guess; for oscillators without forcing."""
     path = _path_near(condition, variation, guess, reach)
     found = [] if path is None else search(path, INTERVALS, near=1.0)
     return [one for one in found if int(one.status) == Status.OK and condition.covers(one)]
@@ -188,14 +189,14 @@ def points_within(
 def _path_near(
     condition: AbstractCondition, variation: Variation, guess: float, reach: float
 ) -> ParameterPath | None:
-    """The path up to `reach` on both sides of the guess, as far as there are oscillators."""
+    """The path up to `reach` on both sides of the guess, as far as oscillators are possible."""
     ends = (guess + side * reach for side in (-1, 1))
     first, last = (_possible(variation, guess, end) for end in ends)
     return ParameterPath(variation, None, (first, last), [condition]) if first < last else None
 
 
 def _label_near(condition: AbstractCondition, variation: Variation, value: Any) -> None:
-    """Labels the guess, for the program that `_bracketed` needs."""
+    """Labels the guess, which compiles the program that `_bracketed` needs."""
     path = _path_near(condition, variation, float(value[0]), REACHES[0])
     if path is not None:
         path.find_labels([float(value[0])])
@@ -206,7 +207,7 @@ def _away(point: BifurcationPoint, guess: float) -> float:
 
 
 def _possible(variation: Variation, guess: float, end: float) -> float:
-    """The end of a way from the guess, or a nearer value up to which there is an oscillator."""
+    """`end`, or a value nearer to the guess, where the oscillator is possible; else the guess."""
     for _ in range(8):
         try:
             variation.check(end)

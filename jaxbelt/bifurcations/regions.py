@@ -51,18 +51,18 @@ class RegionMap(eqx.Module):
 
     In the name of a region a digit says what attracts: 1 an equilibrium only, 2 a cycle, too, 3
     cycles only; 6, 5 and 4 are the same where belts run in opposite directions. With several belts
-    a letter for each cycle says what it sticks to: a belt 0, b belt 1, c both (d belt 2, and on as
-    binary digits; of five belts or more some as [0,1,4]); s, with one belt too, is a cycle that
-    never sticks. These are the names of the paper's Fig. 6; pictures show them in its plane only,
-    as notebook 03 does.
+    a letter for each cycle says what it sticks to: a belt 0, b belt 1, c both (d belt 2, and so on,
+    belts as binary digits; with five belts or more some sets as [0,1,4]); s, also with one belt, is
+    a cycle that never sticks. These are the names of the paper's Fig. 6; pictures show them in its
+    plane only, as notebook 03 does.
 
     Attributes:
         names: Names of the two parameters, arguments of `make`.
         values: Values of each, [n] and [m].
         label: Names of the regions, [n, m], "" where the runs were undecided.
         curves: Bounds of the regions, see `BifurcationCurve`.
-        cycles: By the name of a region, the cycles in its example, attracting ones and the unstable
-            one.
+        cycles: By the name of a region, the cycles in its example, attracting ones first, then
+            unstable ones.
         on_line: Cells where a belt is at rest or without load, or two belts have one velocity,
             [n, m], unless this is so in all of them; their names hold on that line only.
         between: (p, q, name) in each part of the plane between curves that contains no cell.
@@ -90,8 +90,8 @@ class RegionMap(eqx.Module):
     def words(self) -> dict[str, str]:
         """Meaning of the name of each region, as in the key of `plot()`.
 
-        It says what attracts, which belts each cycle sticks to, and, where that differs, that belts
-        run in opposite directions.
+        It says what attracts, which belts each cycle sticks to, and, where regions differ in this,
+        that belts run in opposite directions.
         """
         names = sorted({*self.regions, *(name for *_, name in self.between)})
         opposite = {name: f"; {OPPOSITE}" * (name[0] in "456") for name in names}
@@ -192,9 +192,10 @@ def _attractors_of(name: str, belts: int) -> str:
 
 
 def interior(inside: np.ndarray) -> tuple[int, int]:
-    """Row and column of the cell that is farthest from where a region ends, and from the rim.
+    """Row and column of the cell of a region that is farthest from its bounds and from the rim.
 
-    Of several the last one: where the plane is symmetric, that with the larger parameters.
+    inside: mask of the region, [n, m]. Of several such cells the last one is taken: in a symmetric
+    plane that with the larger parameters.
     """
     # import takes a quarter of a second, which only maps need
     from scipy.ndimage import distance_transform_edt
@@ -255,7 +256,7 @@ def region_map(
     def own(**numbers):
         return variation.own.of(make(**numbers))
 
-    # Two independent computations, most of whose first time is compilation.
+    # Motions in cells and curves are independent; in a first call both mostly compile.
     with ThreadPoolExecutor(1) as beside:
         seen = beside.submit(as_here(_motions_in_all), own, span, values, own_starts)
         if lines:
@@ -275,7 +276,7 @@ def region_map(
 
 
 def varied_by_names(make, names: tuple[str, str], values: Sequence[np.ndarray]) -> Variation:
-    """The variation of two arguments of `make`; values: possible ones of both."""
+    """The variation of two arguments of `make`; values: possible values of each."""
 
     def at(p, q):
         return make(**dict(zip(names, (p, q), strict=True)))
@@ -304,7 +305,7 @@ def _cycles_of_examples(make, names, values, label) -> dict[str, tuple[Cycle, ..
 
 
 def _faces_of(values, label, on_line, curves) -> tuple[Faces, np.ndarray, list[str]]:
-    """The faces of a map, and the cells that determine the name of an area, with their names."""
+    """The faces of a map, and the cells that name them: their points, [cells, 2], and names."""
     (p, q), known = values, label != ""
     if np.any(known & ~on_line):
         known = known & ~on_line

@@ -1,13 +1,14 @@
 """Equilibria that change, and belts that come to rest.
 
-There is no cycle at these points, and few equations: in x1 of the state of rest, or in none.
+There is no cycle at these points, and the equations are few: in the parameter and x1 of the state
+of rest, or in the parameter alone.
 
 - `Hopf`: trace zero at a fixed point (its determinant is always one).
 - `SuddenSliding`: nu_k = 0, with the mass at rest on the belt, x2' = x2 = 0: an equilibrium lies on
   the boundary. No cycle can be an unknown here: as nu_k goes to zero the stick phase lasts ever
-  longer, the slip arc takes ever longer to leave the equilibrium, and in the limit there is none.
-- `BeltAtRest`: the same, if no cycle sticks to the belt: an equilibrium jumps, or a pseudo-focus on
-  an edge becomes another one.
+  longer, the slip arc takes ever longer to leave the equilibrium, and in the limit no cycle exists.
+- `BeltAtRest`: nu_k = 0, too, but no cycle sticks to the belt: an equilibrium jumps, or a
+  pseudo-focus on an edge changes its stability or vanishes.
 
 Hopf points are eqs. (27), (28) of the paper, and sudden sliding is its name. Bifurcations on
 contact edges are in `edge_rests`.
@@ -54,14 +55,14 @@ from .guesses import HINT_BUDGET, orbit_after_stick
 from .special import SpecialPoint, Trail
 from .systems import RestSystem, judged_by, small_newton, third_derivative
 
-#: The unknowns of a state of rest of which all is known.
+#: The unknowns of a system in the parameter alone.
 NOTHING = np.zeros(0)
 #: Guess of a condition on several states of rest: any of them.
 ANY = np.array(-1)
-#: Coefficients smaller than this part of their terms count as zero: points are good to some 1e-12.
+#: A coefficient smaller than this, relative to its terms, is zero: points are good to some 1e-12.
 DEGENERATE = 1e-9
-#: Values at which sudden sliding is searched, relative to where the belt is at rest: first those
-#: where orbits converge quickly; other points may be nearer.
+#: Sudden sliding is solved for from these distances to the value at which the belt is at rest:
+#: orbits converge quickly from the larger ones, but other points may lie nearer than these.
 BESIDE = (1e-2, -1e-2, 1e-4, -1e-4)
 
 # --- conditions on a state of rest ----------------------------------------------------------------
@@ -70,7 +71,7 @@ BESIDE = (1e-2, -1e-2, 1e-4, -1e-4)
 class AbstractRestCondition(AbstractCondition):
     """A condition on a state of rest, at which there is no cycle."""
 
-    #: Why there is none.
+    #: Status of the cycle of a point: why there is none.
     no_cycle: ClassVar[Status] = Status.EQUILIBRIUM
 
     @abc.abstractmethod
@@ -122,7 +123,7 @@ class AbstractRestOfSeveral(AbstractRestCondition):
 
     @abc.abstractmethod
     def systems(self, osc: Oscillator) -> tuple[RestSystem, Any, Array]:
-        """The system of each state of rest, its unknowns, and a status, a row each; compiled."""
+        """The systems of all states of rest, their unknowns and statuses, [rows]; compiled."""
 
     def system(self, osc, guess):
         systems, x, status = self.systems(osc)
@@ -154,7 +155,7 @@ _of_row = jit(pick)
 
 @jit
 def _misses(systems: RestSystem, osc: Oscillator, x: Array) -> Array:
-    """Largest error in the equations of each, [rows]; inf where there is no state of rest."""
+    """Largest error in the equations of each system, [rows]; inf where it has no state of rest."""
     missed = jax.vmap(lambda system, x: jnp.max(jnp.abs(system.residual(osc, x))))(systems, x)
     return jnp.where(jnp.isfinite(missed), missed, jnp.inf)
 
@@ -163,10 +164,10 @@ def _misses(systems: RestSystem, osc: Oscillator, x: Array) -> Array:
 def _row_that_holds(
     systems: RestSystem, osc: Oscillator, x: Array, status: Array, x1: Array, row: ArrayLike
 ) -> Array:
-    """The row that holds, with the mass at rest at x1.
+    """Number of the system whose equations hold with the mass at rest at x1.
 
-    Of several rows that hold the given one, if it is among them: another may hold on the other side
-    of the edge whatever the parameter is.
+    If several hold, it is `row` if that is among them: the system of the other side of an edge may
+    hold, too, whatever the parameter is.
     """
     places = jax.vmap(lambda system, x: system.x1(osc, x))(systems, x)
     misses = _misses(systems, osc, x) + jnp.abs(places - x1)
@@ -177,16 +178,17 @@ def _row_that_holds(
 
 @jit
 def _solved_nearest(family: Family, systems: RestSystem, x0, p0, status, why):
-    """The point of any of the systems that is nearest to the guess.
+    """The point nearest to the guess among those of all systems.
 
-    If there is none: the status of the system that comes nearest to its equations at the guess.
+    If no system has a point, the result of the one with the smallest errors at the guess.
     """
 
     def at_row(family, row):
         system, x, said = pick((systems, x0, status), row)
         return _rest_point(family, system, x, p0, said, why)
 
-    # The choice has no derivative; nor would the point have one beside rows of NaN.
+    # The choice has no derivative. The chosen row is solved once more, alone: in a batch with rows
+    # of NaN the point would have no derivative either.
     fixed = lax.stop_gradient(family)
     points, _ = jax.vmap(lambda row: at_row(fixed, row))(jnp.arange(status.size))
     misses = jnp.where(status == Status.OK, _misses(systems, fixed.at(p0), x0), jnp.inf)
@@ -210,8 +212,8 @@ class HopfSystem(RestSystem):
         return jnp.append(needed[None], trace_of(osc, mode, x[0], rest))
 
     def exists(self, osc, x):
-        # On an edge, too, where the fixed point may lie all along a path: the part of a loop on its
-        # side grows on one side of the point and shrinks on the other.
+        # A fixed point on an edge, where it may lie all along a path, counts, too: on its side of
+        # the edge loops grow on one side of the Hopf point, and shrink on the other.
         slips = jnp.stack(boundary_guards(osc, mode_of(self.codes), jnp.zeros(()))) > 0
         # A belt at rest that can hold nothing is no obstacle.
         holds = jnp.stack([belt.load * belt.friction.static > 0 for belt in osc.belts])
@@ -253,7 +255,7 @@ class Hopf(AbstractRestOfSeveral):
         return [cls()] if before.equilibria != after.equilibria else []
 
     def is_slow_at(self, point):
-        # Around a fixed point on an edge the cycle beside it hardly attracts, or repels.
+        # The cycle around a fixed point on an edge attracts, or repels, only weakly.
         return bool(_is_on_edge(point.oscillator, point.x1))
 
     def type_of(self, point):
@@ -283,7 +285,7 @@ def criticality(coefficient: Array, size: Array) -> str:
 def _hopf_growth(system: HopfSystem, x1: Array, osc: Oscillator) -> tuple[Array, Array]:
     """The first Lyapunov coefficient at a Hopf point, x1 [1], and the size of its terms.
 
-    NaN on a contact edge: no loop is on one side of it, however small.
+    NaN on a contact edge: every loop, however small, crosses it.
     """
     sizes = []
     for belt, code in zip(osc.belts, system.codes, strict=True):
@@ -298,8 +300,8 @@ def _hopf_growth(system: HopfSystem, x1: Array, osc: Oscillator) -> tuple[Array,
 def hopf_limit(kind: str, trail: Trail, vanishes: Callable, *args: Array) -> SpecialPoint | None:
     """The point where the cycle of a curve has shrunk to an equilibrium, if that is near.
 
-    The cycle's own equations are singular there; those of a Hopf point at which also vanishes(osc,
-    codes, x1, *args) is zero are not.
+    The cycle's own equations are singular there; those of a Hopf point, together with the equation
+    vanishes(osc, codes, x1, *args) = 0, are not.
     """
     x1 = trail.x[:, 0]
     if np.ptp(x1) > 5 * trail.step:
@@ -320,8 +322,8 @@ def limit_near(
 ) -> SpecialPoint | None:
     """The point that a curve leads to, if it is found and no farther than `away` from `ahead`.
 
-    attempt: see `Variation.relinearised`; it returns the unknowns, of which both parameters are the
-    last, and the error.
+    attempt: see `Variation.relinearised`; it finds (unknowns, residual), with both parameters last
+    among the unknowns.
     """
     (found, residual), agrees = trail.variation.relinearised(attempt, guess)
     values = np.asarray(found)[-2:]
@@ -332,7 +334,7 @@ def limit_near(
 
 @jit
 def _special_hopf(family: Family, codes, guess: Array, vanishes, *args):
-    """(x1, both parameters) of such a Hopf point, and the error."""
+    """(x1, both parameters) of a Hopf point at which `vanishes` is zero, and the residual."""
 
     def equations(given, u):
         family, codes, *args = given
@@ -350,9 +352,9 @@ def _special_hopf(family: Family, codes, guess: Array, vanishes, *args):
 class RestingBelt(RestSystem):
     """A belt comes to rest, and the mass rests on it in the mode of `codes`; the unknown is x1.
 
-    side: direction in which the belts at rest hold all they can, 0 where they hold nothing; sticks:
-    whether that is the case to solve for; edge: number of the edge on which the mass rests as a
-    pseudo-focus, -1 where it does not.
+    side: sign of the belt's velocity where the stuck belts hold all they can, 0 where they hold
+    nothing; sticks: whether a solution counts; edge: number of the edge on which the mass rests at
+    a pseudo-focus, -1 where there is none.
     """
 
     belt: int | Array
@@ -378,7 +380,7 @@ class RestingBelt(RestSystem):
 
 
 class StoppedBelt(RestSystem):
-    """The velocity of a belt is zero, wherever the mass rests then."""
+    """The velocity of a belt is zero, wherever the mass rests: one equation, no unknown x1."""
 
     belt: int | Array
 
@@ -389,7 +391,7 @@ class StoppedBelt(RestSystem):
         return jnp.asarray(True)
 
     def tests(self, osc, x):
-        # It is at rest all along.
+        # This belt is at rest all along the curve.
         return {
             ("BeltAtRest", (i,)): jnp.where(self.belt == i, jnp.nan, one.velocity)
             for i, one in enumerate(osc.belts)
@@ -397,7 +399,7 @@ class StoppedBelt(RestSystem):
 
 
 class _RestingBeltCondition(AbstractRestCondition):
-    """A belt comes to rest; the kind depends on whether a cycle sticks to it before, or after."""
+    """A belt comes to rest; the kind depends on whether a cycle on either side sticks to it."""
 
     belt: int | Array
 
@@ -437,7 +439,7 @@ class SuddenSliding(_RestingBeltCondition):
         rows = jnp.arange(HINT_BUDGET)
         loop = (rows > orbit.repeats) & (rows < orbit.count)
         sticks = (orbit.status == Status.OK) & jnp.any(loop & (orbit.codes[:, self.belt] == 0))
-        # The contacts at slip onset are those at the equilibrium that it meets.
+        # The contacts in the first arc, up to slip onset, are those at the equilibrium.
         side = jnp.sign(velocity_of(moving, self.belt))
         system = RestingBelt(self.belt, orbit.codes[0], side, sticks, jnp.asarray(-1))
         return system, start[:1], jnp.asarray(Status.OK.value)
@@ -449,9 +451,10 @@ class SuddenSliding(_RestingBeltCondition):
 class BeltAtRest(_RestingBeltCondition):
     """A belt comes to rest where the mass is at rest on it, too, and no cycle sticks to it.
 
-    On the other side its friction has the other direction: the equilibrium jumps, or there is none.
-    A pseudo-focus on an edge stays, with another stability: it repels on one side at least, and
-    attracts where the belt is at rest, so a cycle around it shrinks to it; or there is none.
+    Beyond the point its friction has the other direction: the equilibrium jumps, or vanishes. A
+    pseudo-focus on an edge stays, with another stability: it repels on one side of the point at
+    least, and attracts at the point, so a cycle around it shrinks to it; or the pseudo-focus
+    vanishes.
 
     Args:
         belt: Number of the belt.
@@ -481,9 +484,10 @@ class BeltAtRest(_RestingBeltCondition):
 
 
 def _focus_changes(osc: Oscillator, belt: int | Array, edge: Array) -> Array:
-    """Whether the pseudo-focus on an edge differs beside the point at which a belt is at rest.
+    """Whether the pseudo-focus on an edge changes where the velocity of a belt passes zero.
 
-    Where it attracts on both sides nothing changes; nor where another belt at rest brakes there.
+    It does not where it attracts for both signs of the velocity, nor where another belt at rest
+    brakes the mass there.
     """
     rest = jnp.zeros(())
     beside = [contact_beside(osc, edge, rest, rightward=right) for right in (False, True)]

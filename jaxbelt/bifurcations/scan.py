@@ -1,14 +1,14 @@
 """Bifurcation points along a path in one parameter, found without a guess: `scan`.
 
 Where the labels of two values differ, or cycles do not continue (see `path`), the interval is
-narrowed until Newton's method converges from its ends. The conditions that could make this
-difference are refined from there; a solution inside the interval is a bifurcation point. The rest
-of the interval on either side is treated in the same way, so that points are found that lie closer
+narrowed until Newton's method converges from its ends. The conditions that could cause this
+difference are solved from there; a solution inside the interval is a bifurcation point. The rest of
+the interval on either side is treated in the same way, so that points are found that lie closer
 together than the first values. A difference that no condition explains is narrowed as far as
-numbers allow, and reported.
+rounding allows, and reported.
 
 Labels describe attractors. Points where the unstable cycle in a diagram touches contact edges are
-found in the same way from its signature, see `edges_touched`.
+found in the same way from the cycle's itinerary, see `edges_touched`.
 """
 
 import functools
@@ -51,7 +51,7 @@ from .path import ROOM, ParameterPath
 from .rests import ANY, BeltAtRest, Hopf, SuddenSliding
 from .tangencies import GrazingSliding
 
-#: Kinds that are searched, likelier ones first, and those whose programs compile sooner.
+#: Kinds that are searched; first those that are likelier and whose programs compile sooner.
 LOOKED_FOR: tuple[type[AbstractCondition], ...] = (
     Hopf,
     GrazingSliding,
@@ -69,10 +69,10 @@ LOOKED_FOR: tuple[type[AbstractCondition], ...] = (
     HopfAtInfinity,
 )
 #: How often Newton's method is begun in one search, at most. The paper's path takes 26 attempts, a
-#: point that stays unexplained 130; one takes some 10 ms.
+#: point that stays unexplained 130; an attempt takes some 10 ms.
 MOST_ATTEMPTS = 2000
-#: A point with a larger error than EXACT is solved again from a guess so near, in units of the
-#: parameter.
+#: A point with an error above EXACT is solved again from guesses at this distance on both sides, in
+#: units of the parameter.
 BESIDE_IT = 1e-3
 #: Intervals narrower than this fraction of the span are good guesses for Newton's method. On the
 #: paper's path 1/100 finds the same points as fast, 1/1600 in a third more time.
@@ -91,21 +91,21 @@ def scan(
 ) -> tuple[BifurcationPoint, ...]:
     """Every bifurcation point along a path in one parameter, in order.
 
-    Two points, of which one undoes the other, are seen if one of the first values lies between
-    them. Of points closer together than 2e-6 of the span and of the size of the parameter, or than
-    3e-5 beside a fold of cycles, only one may be reported.
+    Two points, of which the second one undoes the change at the first, are seen if one of the first
+    values lies between them. Of points closer together than 2e-6 of the span and of the size of the
+    parameter, or than 3e-5 beside a fold of cycles, only one may be reported.
 
     Bifurcations at contact edges are searched where there are any; points where only an unstable
     cycle touches them are in `bifurcation_diagram`, as the attractors stay the same. Where
     something changes and no condition explains it, there is a point of kind `Unexplained`, with the
     status UNEXPLAINED and the value where it happens, good to about 1e-9 of the span; its `sides`
     say what there is below and above, and how far apart the branches end. A search ends, with a
-    warning, when it has begun Newton's method two thousand times: the intervals that it did not
-    look into are points of kind `Unexplained` with the status INCOMPLETE; their values and errors
-    are the middles and half the lengths of these. A condition
-    that holds all along, as where an edge moves with an equilibrium, is reported once, with the
-    status DEGENERATE; its value and error are the middle and half the length of the range where it
-    holds, and changes there that Newton's method does not find at once are not reported.
+    warning, when it has begun Newton's method two thousand times: each interval that it did not
+    look into is a point of kind `Unexplained` with the status INCOMPLETE, whose value and error are
+    the middle and half the length of the interval. A condition that holds all along a range, as
+    where an edge moves with an equilibrium, is reported once, with the status DEGENERATE; its value
+    and error are the middle and half the length of that range, and changes there that Newton's
+    method does not find at once are not reported.
 
     Args:
         osc: The oscillator; or a function of the parameter that returns the oscillator and that JAX
@@ -113,7 +113,7 @@ def scan(
         where: Selects the parameter, such as `lambda osc: osc.belts[0].velocity`; None with a
             function.
         span: First and last value of the parameter, dimensionless like the parameter.
-        resolution: Number of intervals that are compared first.
+        resolution: Number of intervals whose ends are compared first.
         conditions: Your own conditions, which are searched, too.
 
     Returns:
@@ -140,7 +140,7 @@ def search(
     """Every bifurcation point on a path, in order; the path keeps its labels.
 
     near: points are solved for from the ends of intervals narrower than this fraction of the path.
-    known: unexplained points of another path, which are not searched once more.
+    known: unexplained points of another path, around which nothing is searched again.
     """
     points = [point for at in path.breaks for point in _at_break(path, at)]
     first, last = path.inside(path.first), path.inside(path.last)
@@ -190,8 +190,8 @@ def search(
 
 
 def calls_ahead(path: ParameterPath) -> Iterator[Callable[[], Any]]:
-    """Calls that compile what nearly every path needs: of what happens to belts' velocities on this
-    one, of Hopf points, and of cycles that begin to stick."""
+    """Calls that compile the programs that nearly every path needs: those for the belts' velocities
+    that coincide or vanish on this path, for Hopf points, and for cycles that begin to stick."""
     belts = len(path.at(path.first).belts)
     loop, value = blank_loop(ROOM, belts), path.inside(path.first)
     ahead: list[tuple[AbstractCondition, float]] = []
@@ -207,7 +207,7 @@ def calls_ahead(path: ParameterPath) -> Iterator[Callable[[], Any]]:
 
 
 def _left(path: ParameterPath, intervals: Sequence[tuple[float, float]]) -> list[BifurcationPoint]:
-    """Points for intervals that were not looked into, and a warning that says so."""
+    """Points for the intervals that were not looked into; warns of them."""
     unit = 1.0 if path.variation.units is None else float(path.variation.own.parameters[0])
     where = ", ".join(f"{number(a * unit)} to {number(b * unit)}" for a, b in intervals)
     warnings.warn(
@@ -227,7 +227,7 @@ def is_at_one_value(point: BifurcationPoint, other: BifurcationPoint) -> bool:
 
 
 def _is_same_point(point: BifurcationPoint, other: BifurcationPoint) -> bool:
-    """Whether two points are of one condition, at one value, and of one cycle or equilibrium."""
+    """Whether two points have the same condition, value, and cycle or equilibrium."""
     if point.condition != other.condition or not is_at_one_value(point, other):
         return False
     if int(point.cycle.status) != Status.OK:
@@ -236,10 +236,10 @@ def _is_same_point(point: BifurcationPoint, other: BifurcationPoint) -> bool:
 
 
 def more_exact(point: BifurcationPoint, variation: Variation) -> BifurcationPoint:
-    """The point as solved from guesses on both sides of it, if that is more exact.
+    """The point, solved again from guesses on both sides of it where that is more exact.
 
-    The integration steps suit the motion at the guess; and from afar Newton's method may end at a
-    double root of an arc that vanishes, which the other side does not have.
+    The integration steps suit the motion at the guess. And from afar Newton's method may end at a
+    double root where an arc vanishes; from the other side of the point there is no such root.
     """
     if int(point.status) != Status.OK:
         return point
@@ -269,8 +269,8 @@ def edges_touched(
 ) -> tuple[BifurcationPoint, ...]:
     """Points where the unstable cycle begins or ceases to pass a contact edge.
 
-    values: in order, in a stretch in which nothing else happens; those at which no such cycle is
-    found are passed over. around: number of the equilibrium, see `unstable_cycle`.
+    values: increasing, without other bifurcations between them; those at which no unstable cycle is
+    found are skipped. around: number of the equilibrium, see `unstable_cycle`.
     """
     if not path.edged:
         return ()
@@ -318,16 +318,16 @@ def edges_touched(
     return by_value(points)
 
 
-# --- what makes the difference between two values -------------------------------------------------
+# --- what causes the difference between two values ------------------------------------------------
 
 
 def _explained_range(
     path: ParameterPath, a: float, b: float, point: BifurcationPoint
 ) -> tuple[float, float]:
-    """The range around a point that it explains; it is the difference between a and b.
+    """The range around a point in which it explains differences; it explains that of a and b.
 
-    A slow point may lie just outside of the interval. Then it explains the half of the interval
-    beside it, or all of it, if it is narrow: labels so near to it are not reliable.
+    A slow point may lie just outside of the interval from a to b. Then it explains the half of the
+    interval next to it, or all of a narrow interval: labels so near to it are not reliable.
     """
     value = float(point.value)
     before, after = path.beside(value, slow=point.condition.is_slow_at(point))
@@ -352,21 +352,21 @@ def _accepts(path: ParameterPath, a: float, b: float, point: BifurcationPoint) -
 def _is_inside(a: float, b: float, point: BifurcationPoint) -> bool:
     """Whether a point is in an interval, within its error.
 
-    At a value with a label it lies, up to rounding, on either side of that.
+    A point at an end of the interval lies inside of it or outside by rounding only.
     """
     value, error = float(point.value), float(point.error)
     return a - error <= value <= b + error
 
 
 def _explained(path: ParameterPath, a: float, b: float) -> BifurcationPoint | None:
-    """A bifurcation point between two values that differ, or None."""
+    """A bifurcation point between two values with different motions, or None."""
     marks = zip(path.conditions, path.label(a).marks, path.label(b).marks, strict=True)
     own = [condition for condition, mark, other in marks if mark != other]
     return _first_found(path, a, b, [*own, *_possible_kinds(path, a, b)])
 
 
 def _possible_kinds(path: ParameterPath, a: float, b: float) -> list[AbstractCondition]:
-    """Conditions that could make the difference between two values."""
+    """Conditions that could cause the difference between the labels of two values."""
     labels = path.label(a), path.label(b)
     return [condition for kind in LOOKED_FOR for condition in kind.between(*labels, path.edged)]
 
@@ -374,9 +374,9 @@ def _possible_kinds(path: ParameterPath, a: float, b: float) -> list[AbstractCon
 def _beside_it(
     path: ParameterPath, a: float, b: float, point: BifurcationPoint
 ) -> list[BifurcationPoint]:
-    """Points of other belts, or of other cycles, at the value of a point.
+    """Points of the same kind for other belts, or other motions, at the value of a point.
 
-    Where there is a symmetry several happen at once.
+    With a symmetry several such points coincide.
     """
     sought = point.condition.sought
     found = [point]
@@ -389,12 +389,12 @@ def _beside_it(
 
 
 def _is_apart(point: BifurcationPoint, other: BifurcationPoint) -> bool:
-    """Whether two points at one value are of two conditions or belts, or of two motions."""
+    """Whether two points at one value differ in their condition, belts or motion."""
     return point.condition.sought != other.condition.sought or _is_another(point, other)
 
 
 def _is_another(point: BifurcationPoint, other: BifurcationPoint) -> bool:
-    """Whether two points at one value are of two cycles, or of two equilibria."""
+    """Whether two points at one value have different cycles, or different equilibria."""
     if all(int(one.cycle.status) == Status.OK for one in (point, other)):
         return bool(distance(place_of(point.cycle), place_of(other.cycle)) >= SAME_CYCLE)
     places = ([float(one.x1), 0.0] for one in (point, other))
@@ -404,7 +404,7 @@ def _is_another(point: BifurcationPoint, other: BifurcationPoint) -> bool:
 def _first_found(
     path: ParameterPath, a: float, b: float, conditions: Sequence[AbstractCondition]
 ) -> BifurcationPoint | None:
-    """The first condition that holds within an interval, else the first one just beside it."""
+    """The first point found within an interval, else the first one found just outside, or None."""
     outside = None
     for condition in conditions:
         for point in _all_found(path, a, b, condition):
@@ -417,9 +417,9 @@ def _first_found(
 def _all_found(
     path: ParameterPath, a: float, b: float, condition: AbstractCondition
 ) -> Iterator[BifurcationPoint]:
-    """Points where a condition holds within an interval, from each of its beginnings.
+    """Points where a condition holds within an interval, solved for from each of its beginnings.
 
-    A slow one may be just beside the interval. One point may come from several beginnings.
+    Points of a slow condition may lie just outside. Several beginnings may give the same point.
     """
     slow = condition.slow
     low, high = (path.beside(a, slow=True)[0], path.beside(b, slow=True)[1]) if slow else (a, b)
@@ -450,7 +450,7 @@ def _at_break(path: ParameterPath, value: float) -> list[BifurcationPoint]:
         found.append(_first_found(path, *interval, conditions))
     points = [point for point in found if point is not None]
     if not points and not labels[0].is_as(labels[1]):
-        # Something else may happen exactly there.
+        # A bifurcation of another kind may happen at exactly this value.
         point = _explained(path, *interval)
         unknown = replace(
             _unexplained(path, *interval), value=jnp.asarray(value), error=jnp.zeros(())
@@ -463,10 +463,10 @@ def _at_break(path: ParameterPath, value: float) -> list[BifurcationPoint]:
 
 
 def _is_degenerate(path: ParameterPath, a: float, b: float, points: list[BifurcationPoint]) -> bool:
-    """Whether one of the conditions that could make the difference holds all along.
+    """Whether a condition that could cause the difference holds all along the interval.
 
-    Where it does, the side on which the oscillator appears to be is rounding. A point in the middle
-    of the values where it holds is added to the points, once.
+    If so, rounding decides on which side of it the labels are. A point in the middle of the range
+    where the condition holds is added to `points`, once.
     """
     for condition in _possible_kinds(path, a, b):
         if all(_holds_along(path, value, condition) for value in (a, b)):
@@ -488,21 +488,21 @@ def _is_degenerate(path: ParameterPath, a: float, b: float, points: list[Bifurca
 def _last_along(
     path: ParameterPath, values: Sequence[float], condition: AbstractCondition
 ) -> float:
-    """The last of the values, from the first one on, at which a condition holds all along."""
+    """The last of the values up to which, from the first one on, a condition holds all along."""
     along = takewhile(lambda value: _holds_along(path, value, condition), values)
     return list(along)[-1]
 
 
 def _holds_along(path: ParameterPath, value: float, condition: AbstractCondition) -> bool:
-    """Whether a condition holds at a value and beside it, all along the path."""
+    """Whether a condition holds at a value and all along the path beside it (DEGENERATE)."""
     beginnings = condition.beginnings(path.at(value), path.cycles[value])
     points = (condition.point_from(path.variation, value, one) for one in beginnings)
     return any(int(point.status) == Status.DEGENERATE for point in points)
 
 
 def _unexplained(path: ParameterPath, a: float, b: float) -> BifurcationPoint:
-    """A point between two values close together, and what there is below and above."""
-    # As far off as labels are told apart: nearer to the point no cycle may be solved for.
+    """An unexplained point between two close values, with the motions below and above it."""
+    # As far off as `beside` is: nearer to the point it may be impossible to solve for a cycle.
     before, after = path.beside(0.5 * (a + b))
     ends = max(before, path.inside(path.first)), min(after, path.inside(path.last))
     path.find_labels(ends)
@@ -518,7 +518,7 @@ def _unsolved_point(
     condition: AbstractCondition = UNNAMED,
     why: Status = Status.UNEXPLAINED,
 ) -> BifurcationPoint:
-    """A point where something changes, known only up to a width, with the reason."""
+    """A point of a change that is not solved for; width: its error; why: its status."""
     p, none = np.array([value]), jnp.asarray(jnp.nan)
     ok, steps = jnp.asarray(Status.OK.value), jnp.full(NEWTON_STEPS, jnp.nan)
     status, family = jnp.asarray(why.value), path.variation.family(p)

@@ -1,6 +1,6 @@
 """Points of codimension two, which curves of bifurcation points pass or end in: `SpecialPoint`.
 
-And the last stretch of a curve, from which its condition finds the point that it ends in: `Trail`.
+`Trail` is the last stretch of a curve, from which its condition finds the point in which it ends.
 """
 
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -17,9 +17,9 @@ from ..tables import table_of
 if TYPE_CHECKING:
     import pandas
 
-#: A curve that comes so near to a belt at rest comes no nearer in any number of steps.
+#: A curve that comes so near, in the parameters, to a belt at rest arrives in no number of steps.
 CREEPS = 1e-6
-#: A cycle that reaches less far than TOUCHES beyond an edge hardly touches it; less than TOUCHED is
+#: A cycle that reaches beyond an edge by less than TOUCHES hardly touches it; less than TOUCHED is
 #: rounding.
 TOUCHES, TOUCHED = 1e-5, 1e-13
 #: Largest change of a cycle or fixed point in a step, relative to its size. Along curves of classes
@@ -52,7 +52,7 @@ class SpecialPoint(NamedTuple):
         belts: Numbers of the belts concerned.
         values: Values of the two parameters.
         residual: Largest error in all equations; where the end of a curve is extrapolated, or the
-            events of a motion change, error of that.
+            events of a motion change, the error of the values.
     """
 
     kind: str
@@ -61,7 +61,7 @@ class SpecialPoint(NamedTuple):
     residual: float
 
     def measured_in(self, units: np.ndarray) -> "SpecialPoint":
-        """The same point for parameters that were in these units, [2]."""
+        """The same point with its values converted from these units of the parameters, [2]."""
         first, second = (value * float(unit) for value, unit in zip(self.values, units))
         return self._replace(values=(first, second))
 
@@ -85,12 +85,13 @@ class SpecialPoint(NamedTuple):
 
 
 def is_elsewhere(place: np.ndarray, other: np.ndarray, far: float) -> bool:
-    """Whether two places a step or less apart are of two motions, where known."""
+    """Whether the places of two points, a step or less apart, are of different motions; False where
+    a place is NaN."""
     return bool(distance(place[:4], other[:4], least=far) > far)
 
 
 def extrapolated_to_zero(x: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """What the polynomial through values at some x, [rows] or [rows, k], has at zero."""
+    """Value at x = 0 of the polynomial through `values`, [rows] or [rows, k], at x, [rows]."""
     from scipy.interpolate import KroghInterpolator  # half a second that only curves need
 
     return np.asarray(KroghInterpolator(x, values)(0.0))
@@ -99,16 +100,16 @@ def extrapolated_to_zero(x: np.ndarray, values: np.ndarray) -> np.ndarray:
 def where_belts_stop(
     variation: Variation, values: np.ndarray, near: float, far: float
 ) -> SpecialPoint | None:
-    """The point where belts come to rest at the end of a curve, if a parameter is near to that.
+    """The point where belts come to rest at the end of a curve, if a belt is near to rest.
 
-    The time that the mass sticks goes to infinity there, so no step leads there. Where two belts
-    come to rest both parameters are known, else one: the limit of the other is extrapolated, and
-    the residual is the difference of a parabola and a line there.
+    The time that the mass sticks goes to infinity there, so no step leads there. If two belts come
+    to rest, their velocities determine both parameters, else one: the limit of the other one is
+    extrapolated, and the residual is the difference between a parabola and a line there.
 
     Args:
         variation: Of both parameters.
         values: Values in the last rows, [rows, 2].
-        near: Distance of a parameter from its value at rest up to which the point counts.
+        near: Distance in the parameters up to which a belt counts as near to rest.
         far: Largest distance of the point from the last row.
     """
     if len(values) < 3 or has_clock(variation.oscillator(values[-1])):
@@ -140,9 +141,9 @@ def where_edge_is_touched(
 ) -> SpecialPoint | None:
     """The point where the part of a cycle beyond a contact edge vanishes at the end of a curve.
 
-    The duration of that part goes like the square root of its extent beyond the edge, so no step
-    leads there; the parameters are linear in that root. The residual is the distance of the point
-    from the last row.
+    The duration of that part is like the square root of its extent beyond the edge, so no step
+    leads there; the parameters are extrapolated as linear functions of that root. The residual is
+    the distance of the point from the last row.
 
     Args:
         variation: Of both parameters.
@@ -169,10 +170,11 @@ def where_edge_is_touched(
 
 
 class Trail(NamedTuple):
-    """The last stretch of a curve, from which its condition finds where it leads.
+    """The last stretch of a curve, from which its condition finds the point it leads to.
 
     variation: of the two parameters; step: between rows; values: of the parameters in the last
-    rows, three at most, [rows, 2]; system, x: of the last row; end: why the stretch ends there.
+    rows, three at most, [rows, 2]; system, x: system and its unknowns in the last row; end: why the
+    stretch ends there.
     """
 
     variation: Variation
@@ -183,7 +185,7 @@ class Trail(NamedTuple):
     end: Stop
 
     def stopping(self) -> "Stopping | None":
-        """A belt that comes to rest and whose velocity depends on one of the parameters alone."""
+        """The belt that comes to rest, if its velocity depends on one parameter alone, or None."""
         if len(self.values) < 3:
             return None
         oscs = [self.variation.oscillator(row) for row in self.values]
@@ -202,8 +204,8 @@ class Trail(NamedTuple):
 class Stopping(NamedTuple):
     """A belt that comes to rest at the end of a curve.
 
-    held: the parameter that its velocity depends on, 0 or 1; belt: its number; value: of that
-    parameter where it is at rest; velocities: in the last rows.
+    held: number of the parameter that its velocity depends on, 0 or 1; belt: number of the belt;
+    value: value of that parameter where the belt is at rest; velocities: in the last rows, [rows].
     """
 
     held: int

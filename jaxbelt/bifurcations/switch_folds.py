@@ -7,13 +7,13 @@ exp(-t), until the needed force exceeds the capacity. So the mass is released no
 = 0. The cycle is lost too early, by about (m - 1) v_star over the speed at which the gap opens, m
 the multiplier of the cycle that it meets.
 
-How it is lost: the later the orbit enters the band, the less time is left for r to decay, the later
-it enters in the next loop. So the cycle that sticks meets another one that sticks, a smooth fold.
-With the unknowns (g, tau, T) of such a cycle, g the distance before the point of x2' = 0 at which
-it enters, T the duration of slip, there are three equations: slip onset at the end of the band, and
-the orbit from there comes back to the entry (x1, x2). At the fold their Jacobian is singular; that
-is the fourth equation, for the fourth unknown, a parameter of the oscillator or v_star itself. As
-v_star goes to zero, g/v_star goes to m.
+The cycle is lost like this: the later the orbit enters the band, the less time is left for r to
+decay, and the later it enters in the next loop. So the cycle that sticks meets another one that
+sticks, in a smooth fold. The unknowns of such a cycle are (g, tau, T), g the distance in x1 of the
+entry before the point of x2' = 0, T the duration of slip. There are three equations: slip onset at
+the end of the band, and the orbit from there comes back to the entry (x1, x2). At the fold their
+Jacobian is singular; that is the fourth equation, for the fourth unknown, a parameter of the
+oscillator or v_star itself. As v_star goes to zero, g/v_star goes to m.
 """
 
 from collections.abc import Callable
@@ -39,10 +39,10 @@ from .tangencies import NonsmoothFold
 #: Integration steps of order twelve for the slip phase: with half as many folds move by 2e-12, with
 #: twice as many by 5e-15.
 SLIP_STEPS = 64
-#: The band of the first solution, and the number of bands from it to the given one: so bands up to
-#: 1e-2 are reached; with three, or from 1e-8, up to 1e-3.
+#: v_star of the first solution, and the number of solutions from it to the given v_star: so v_star
+#: up to 1e-2 is reached; with three solutions, or from 1e-8, up to 1e-3.
 FIRST, STAGES = 1e-6, 4
-#: Bands from which the search for the band of a given fold starts.
+#: The v_star from which the search for the band of a given fold starts.
 TYPICAL = 1e-4
 
 
@@ -69,7 +69,7 @@ def switch_fold(
         point: The exact fold, from `refine(NonsmoothFold(belt), ...)`, with one stick phase and one
             slip mode.
         v_star: Half-width of the band.
-        where: Selects its parameter, as for `refine`.
+        where: Selects the parameter of the point, as for `refine`.
 
     Returns:
         The `SwitchFold`.
@@ -149,10 +149,10 @@ def _where_found(value, v_star, residual) -> SwitchFold:
 
 def _equations(point, index: int, u: Array, value: Array, v_star: Array) -> Array:
     """Four equations for (g, tau, T), in units of their limits for small v_star, and the fourth
-    unknown.
+    unknown; u: (g, tau, T) in these units first.
 
-    As v_star goes to zero g goes to m v_star. The way in the band is g and, from there, the way on
-    which the needed force grows from u0 mu(v_star) to u0 mus.
+    As v_star goes to zero g goes to m v_star. The mass covers in the band the distance g in x1 and,
+    from there, that in which the needed force grows from u0 mu(v_star) to u0 mus.
     """
     point = lax.stop_gradient(point)
     belt = point.oscillator.belts[point.condition.belt]
@@ -169,10 +169,10 @@ def _equations(point, index: int, u: Array, value: Array, v_star: Array) -> Arra
 
 
 def _cycle_equations(point, osc: Oscillator, v_star: Array, unknowns: Array) -> Array:
-    """Three equations of a cycle: errors of the force, of x1 and of x2.
+    """Errors of the three equations of a cycle: in the force, in x1 and in x2, [3].
 
-    Slip onset at the end of the band, and the slip phase, followed backwards from its end, begins
-    there.
+    The needed force is at its limit at the end of the band, and the slip phase, followed backwards
+    from the entry into the band, begins at that end.
     """
     gap, tau, duration = unknowns
     k = point.condition.belt

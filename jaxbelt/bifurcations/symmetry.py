@@ -1,4 +1,4 @@
-"""Motions that are their own images, and how they cease to be: `SymmetryBreaking`.
+"""Motions that are their own images, and how they lose this symmetry: `SymmetryBreaking`.
 
 Where belts and forces look the same from both sides (x1 -> -x1, half of a period of the forcing
 later) each motion has an image, which may be the motion itself. Along a branch of such symmetric
@@ -20,15 +20,15 @@ from .base import Line
 from .forced import ArcRows, Beginning, UnitCircle
 from .timed_systems import SYMMETRIC, OnBreakingSymmetry
 
-#: Parts of a period at which an oscillator is compared with its image, and how exactly.
+#: Fractions of a period at which an oscillator is compared with its image, and the tolerance.
 SAMPLED_PARTS, ROUNDING_OF_BELTS = (0.0, 0.13, 0.37, 0.71), 1e-12
 
 
 class SymmetryBreaking(UnitCircle):
     """A multiplier of a symmetric motion is 1, and two asymmetric motions leave: a pitchfork.
 
-    Symmetric is a motion whose image under x1 -> -x1 is itself, half of its period later; it goes
-    on, stable on one side only.
+    A motion is symmetric if its image under x1 -> -x1 is itself, half of its period later. It goes
+    on through the point, stable on one side only.
     """
 
     caption: ClassVar[str] = "symmetry breaking"
@@ -51,8 +51,8 @@ class SymmetryBreaking(UnitCircle):
 
 
 def asymmetry_of(osc: Oscillator, motion: PeriodicMotion) -> np.ndarray | None:
-    """The state of a motion at the phase 0 plus the one half of its period later, [2]; None of an
-    even number of periods, which is no symmetric motion's."""
+    """Sum of the states of a motion at the phase 0 and half of its period later, [2]; None for an
+    even number of periods, as no symmetric motion has it."""
     half, odd = divmod(motion.periods, 2)
     if not odd:
         return None
@@ -67,7 +67,8 @@ def is_symmetric(osc: Oscillator, motion: PeriodicMotion) -> bool:
 
 
 def symmetric_near(osc: Oscillator, motion: PeriodicMotion) -> PeriodicMotion | None:
-    """A motion, if it is symmetric, or the symmetric one between it and its image."""
+    """The motion itself if it is symmetric, else the symmetric one between it and its image, or
+    None."""
     away = asymmetry_of(osc, motion)
     if away is None or is_symmetric(osc, motion):
         return None if away is None else motion
@@ -78,7 +79,7 @@ def symmetric_near(osc: Oscillator, motion: PeriodicMotion) -> PeriodicMotion | 
 
 
 def image_of(osc: Oscillator, motion: PeriodicMotion) -> PeriodicMotion:
-    """The image of a motion of an odd number of periods."""
+    """The image under x1 -> -x1 of a motion with an odd number of periods."""
     later = state_near_start(osc, motion, 0.5, later=motion.periods // 2)
     return periodic_from(osc, -later, motion.periods, motion.chain.turns)
 
@@ -101,7 +102,7 @@ def looks_the_same(osc: Oscillator, turns: int) -> bool:
 
 
 def _belt_or_image(belt, way: float) -> tuple:
-    """What a belt, or its image (way -1), is at an instant."""
+    """Structure and numbers of a belt at an instant, or of its image (way -1), to compare."""
     edges = (belt.lower, belt.upper) if way > 0 else (-belt.upper, -belt.lower)
     law, structure = jax.tree.flatten(belt.friction)
     numbers = [way * belt.velocity, belt.load, *edges, *law]

@@ -2,9 +2,9 @@
 
 A `CycleSystem` has 3N + 1 equations: those of a cycle with a fixed signature, see `cycles`, and a
 condition. A `RestSystem` has k + 1 equations in the k unknowns of a state of rest. With one more
-unknown, a parameter, Newton's method finds a point; with two, they are followed along a curve.
-`seen_at` of both judges a solution: whether it is a motion that exists, and the functions to watch
-along a curve.
+unknown, a parameter, Newton's method finds a point; with two parameters the solutions are a curve,
+which is followed. `seen_at` of both judges a solution: whether it is a motion that exists, and the
+functions to watch along a curve.
 """
 
 import abc
@@ -37,28 +37,28 @@ from ..results import Status
 
 #: Weight of the unknowns of a cycle in the length of a step along a curve, beside the two
 #: parameters; large unknowns count less, as durations of stick phases go to infinity where a belt
-#: comes to rest. Of seven curves of class (b) one ends too early with a tenth of it; with three
-#: times as much they take half as many points again.
+#: comes to rest. Of seven curves of class (b) one ends too early with a tenth of this weight; with
+#: three times as much they take half as many points again.
 WEIGHT = 0.1
-#: A point is determined where its error, in units of the parameter, is smaller: at a double root it
-#: is some 1e-7, and where the equations hold all along the parameter 1 and more.
+#: Equations determine the parameter if its error, in its units, is smaller: at a double root it is
+#: some 1e-7, and where the equations hold for all values of the parameter 1 and more.
 DETERMINED = 1e-3
-#: The integration steps of an arc are cut into so many parts if they leave a larger error in its
-#: equations, relative to the motion: beside a slow belt and under a steep law the error was 1e-8,
-#: which moved the point by 1e-6, and 1e-15 with the parts.
+#: The integration steps of an arc are cut into PARTS_OF_ARC parts if their error in its equations,
+#: relative to the motion, exceeds EXACT_ARC: beside a slow belt and under a steep law the error was
+#: 1e-8, which moved the point by 1e-6, and 1e-15 with the parts.
 PARTS_OF_ARC, EXACT_ARC = 8, 1e-13
-#: The place where there is no motion.
+#: The place, see `place_of`, where there is no motion to compare.
 NOWHERE = np.full(5, np.nan)
-#: Functions, by the name of the special point at which each one vanishes and the belts concerned.
+#: Values of functions, by the name of the special point where each vanishes and its belts.
 Tests = dict[tuple[str, tuple[int, ...]], Any]
 
 
 class Seen(NamedTuple):
-    """What is seen at a point of a curve.
+    """What is computed at a point of a curve.
 
-    tests: functions to watch; exists: whether there is such a motion; multiplier: of the cycle, or
-    NaN; residual: the largest error in all equations; is_cut: whether arcs end wherever x2 is
-    extreme.
+    tests: values of the functions to watch; exists: whether the solution is a motion that exists;
+    multiplier: of the cycle, or NaN; residual: the largest error in all equations; is_cut: whether
+    an arc ends at every extremum of x2.
     """
 
     tests: Tests
@@ -72,7 +72,7 @@ class AbstractSystem(eqx.Module):
     """Equations in the unknowns of a motion, one more than there are unknowns."""
 
     def has_signature_of(self, other: "AbstractSystem") -> bool:
-        """Whether both are of one signature; False for states of rest, which have none."""
+        """Whether both systems have one signature; False for states of rest, which have none."""
         return False
 
     @abc.abstractmethod
@@ -95,7 +95,7 @@ class AbstractSystem(eqx.Module):
 
     @abc.abstractmethod
     def shaped(self, x: Array) -> Array:
-        """The unknowns in their shape, from one row of numbers."""
+        """The unknowns in their shape, from a flat array."""
 
     @abc.abstractmethod
     def weights(self, x: Array) -> Array:
@@ -103,7 +103,7 @@ class AbstractSystem(eqx.Module):
 
     @abc.abstractmethod
     def remeshed(self, osc: Oscillator, x: Array) -> "AbstractSystem":
-        """The same system with new integration steps, where there are any."""
+        """The same system with new integration steps, if it has any."""
 
 
 def velocity_tests(osc: Oscillator) -> Tests:
@@ -119,16 +119,16 @@ def velocity_tests(osc: Oscillator) -> Tests:
 
 
 class RestSystem(AbstractSystem):
-    """k + 1 equations in the k unknowns of a state of rest: none, or x1."""
+    """k + 1 equations in the k unknowns of a state of rest, which are x1 or none."""
 
     @property
     def otherwise(self) -> Status:
-        """The status of a solution that does not exist."""
+        """Status of a solution for which `exists` is False."""
         return Status.NOT_ADMISSIBLE
 
     @abc.abstractmethod
     def exists(self, osc: Oscillator, x: Array) -> Array:
-        """Whether a solution is such a state."""
+        """Whether a solution is a state of rest of this kind."""
 
     def tests(self, osc: Oscillator, x: Array) -> Tests:
         """Functions to watch along its curve."""
@@ -176,7 +176,7 @@ class AbstractChainSystem(AbstractSystem):
         """The error of the integration steps in the equations of each arc at x, [N]."""
 
     def has_signature_of(self, other: AbstractSystem) -> bool:
-        """Whether both have the same arcs, and ask the same of the same arc, belt and edge."""
+        """Whether both have the same arcs, and conditions on the same arc, belt and edge."""
         if type(other) is not type(self):
             return False
         own, others = _numbers_in(self), _numbers_in(other)
@@ -203,7 +203,7 @@ class AbstractChainSystem(AbstractSystem):
 
 
 def _numbers_in(system: AbstractChainSystem) -> list[np.ndarray]:
-    """The codes of the arcs, and all whole numbers of a system."""
+    """The codes of the arcs, and all arrays of integers or booleans in a system."""
     numbers = [np.asarray(leaf) for leaf in jax.tree.leaves(eqx.filter(system, eqx.is_array))]
     return [np.asarray(system.chain.codes), *(one for one in numbers if one.dtype.kind in "biu")]
 
@@ -218,11 +218,11 @@ class CycleSystem(AbstractChainSystem):
 
     @abc.abstractmethod
     def condition(self, osc: Oscillator, z: Array, miss: Array) -> Array:
-        """The expression that vanishes; miss: error of the tangent arcs, see `cycles.residual`."""
+        """The expression that vanishes; miss: error of tangent arcs, see `shooting.residual`."""
 
     def judge(self, osc: Oscillator, z: Array, cycle: Cycle, slope: Array) -> tuple[Array, Array]:
-        """Status of a solution, and the multiplier to report; slope: multiplier without stick
-        phases."""
+        """Status of a solution, and the multiplier to report; slope: multiplier with stick phases
+        left out."""
         return cycle.status, jnp.asarray(jnp.nan)
 
     def watch(self, osc: Oscillator, z: Array, slope: Array) -> tuple[Tests, Any, Any]:
@@ -286,8 +286,8 @@ class CycleSystem(AbstractChainSystem):
 
 
 def stick_phase_from(osc: Oscillator, chain: Chain, row: Array) -> Array:
-    """The arc `row` and the arcs after it in the stick phase that it begins (one that passes
-    edges)."""
+    """Mask, [arcs], of the stick phase that begins with the arc `row`; it has several arcs where it
+    passes edges."""
     stuck = chain.used & jnp.any(chain.codes == 0, axis=-1)
     rows = jnp.arange(stuck.size)
     before = (rows - 1) % jnp.maximum(jnp.sum(chain.used), 1)
@@ -300,19 +300,21 @@ def stick_phase_from(osc: Oscillator, chain: Chain, row: Array) -> Array:
 def nearest_contacts(
     osc: Oscillator, chain: Chain, z: Array, sticks: Array, without: bool | Array = False
 ) -> tuple[Array, Array]:
-    """Distance of a cycle from another signature at each belt, and whether it sticks there,
-    [belts].
+    """Distance of a cycle from a change of its signature at each belt, and whether it sticks to the
+    belt, [belts] each.
 
-    The shortest of its stick phases, among the arcs `sticks`; if there is none, the distance of its
-    nearest extremum of x2 from the boundary. Or, if less, that of x2 from the boundary where the
-    cycle passes a contact edge slipping, as it meets both at once then. inf where none of these
-    exists. without: belts that are ignored where arcs pass an edge, [arcs, belts].
+    The distance is the duration of the shortest stick phase, among the arcs of the mask `sticks`;
+    without a stick phase it is r at the extremum of x2 nearest to the boundary. Where the cycle
+    slips over a contact edge it is r there, if that is less: at zero the cycle meets edge and
+    boundary at once. inf where none of these exists. without: belts that are ignored where arcs
+    pass an edge, [arcs, belts].
     """
     n, without = len(osc.belts), jnp.broadcast_to(without, chain.codes.shape)
     following = after_each(chain, z)
     extrema = chain.used & (chain.ends == Ends(n).extremum_x2)
     passes = (chain.ends >= n) & (chain.ends < 3 * n)
-    # Beyond a point to which the cycle shrinks the equations go on, on the other side of the edge.
+    # The equations have solutions beyond a point to which the cycle shrinks, too, with entries on
+    # the other side of the edge; these do not count.
     passes = passes & jax.vmap(functools.partial(_is_within, osc))(chain.codes, z[:, 0])
     after = following_codes(chain)
     nearest, stuck = [], []
@@ -323,7 +325,7 @@ def nearest_contacts(
         signs, signs_after = chain.codes[:, belt], after[:, belt]
         slips = jnp.abs(signs) == 1
         gap = jnp.min(jnp.where(extrema & slips, signs * r, jnp.inf))
-        # Where it sticks before or after the edge it is on the boundary anyway.
+        # Where the mass sticks before or after the edge it is on the boundary anyway.
         sign = jnp.where(slips, signs, signs_after)
         moves = passes & (signs != 0) & (signs_after != 0) & (jnp.abs(sign) == 1)
         moves = moves & ~without[:, belt]
@@ -334,12 +336,12 @@ def nearest_contacts(
 
 
 def _is_within(osc: Oscillator, codes: Array, x1: Array) -> Array:
-    """Whether a place is within the contact edges of a mode, or on one."""
+    """Whether x1 lies between the contact edges of a mode, or on one of them."""
     return jnp.min(jnp.stack(edge_guards(osc, mode_of(codes), x1))) >= -HOLDS
 
 
 def contact_tests(name: str, nearest: Array, watched: Array) -> Tests:
-    """These distances for the watched belts, under a name."""
+    """The distances `nearest`, [belts], as tests of a name, NaN unless watched and finite."""
     known = jnp.where(watched & jnp.isfinite(nearest), nearest, jnp.nan)
     return {(name, (belt,)): known[belt] for belt in range(nearest.size)}
 
@@ -374,7 +376,7 @@ def nearest_edge(osc: Oscillator, chain: Chain, z: Array, without: bool | Array 
 
 
 class _InParameter(Equations):
-    """The equations of a system in its own unknowns and one parameter, in units of that."""
+    """The equations of a system in its own unknowns and one parameter, that in `Family.unit`."""
 
     system: Any
 
@@ -389,9 +391,9 @@ class _InParameter(Equations):
 class Solution(NamedTuple):
     """A solution of a system near a guess, by Newton's method.
 
-    z, p: unknowns and parameter, [1]; steps: length of each step, NaN padded; iterations: their
-    number; residual: the largest error in the equations; error: a bound on that of p; status: that
-    of the guess, where it was not OK, or whether the steps converged.
+    z: unknowns; p: parameter, [1]; steps: length of each step, NaN padded; iterations: number of
+    steps; residual: the largest error in the equations; error: a bound on the error of p; status:
+    that of the guess, where it was not OK, else whether the steps converged.
     """
 
     z: Array
@@ -411,7 +413,7 @@ def solve_system(family: Family, system: Any, z0, p0, status: Array) -> Solution
     solved = solve(_InParameter(system), family, (z0, lax.stop_gradient(p0) / unit))
     z, p, steps = solved.z[0], unit * solved.z[1], solved.lengths
     iterations = jnp.sum(~jnp.isnan(steps))
-    # By the last steps: the residual costs an integration more, and who asks for it gets it.
+    # Convergence is judged by the last steps: the residual costs an integration, not always needed.
     last, before = steps[jnp.maximum(iterations - 1, 0)], steps[jnp.maximum(iterations - 2, 0)]
     converged = is_settled(last, before, HOLDS) | (last < STEP_ROUNDING) | (status != Status.OK)
     status = jnp.where(converged, status, Status.NO_CONVERGENCE.value)
@@ -421,10 +423,10 @@ def solve_system(family: Family, system: Any, z0, p0, status: Array) -> Solution
 
 
 def _accuracy(osc: Oscillator, system: Any, z: Array, matrix: Array):
-    """The residual, and a bound on the error of p, in its units.
+    """The largest residual, and a bound on the error of p, in its units.
 
-    The bound is the effect of the residual, with the steps and with halved ones, whose rounding has
-    any signs, and of rounding in the unknowns.
+    The bound is the effect on p of the residuals, with the integration steps as they are and with
+    halved ones (by their sizes, as rounding has any sign), and of rounding in the unknowns.
     """
 
     def value(chain):
@@ -432,14 +434,14 @@ def _accuracy(osc: Oscillator, system: Any, z: Array, matrix: Array):
 
     values = system.chain.on_both_meshes(value)
     weights = jnp.linalg.solve(matrix.T, jnp.zeros(values.shape[1]).at[-1].set(1.0))
-    # Rounding of states and times; for durations, however long, the velocity cancels it.
+    # Rounding of states and times; that of a long duration is multiplied by a small velocity.
     rounding = 2e-15 * (1 + jnp.max(jnp.abs(z[:, :-1]))) * jnp.sum(jnp.abs(weights))
     effect = jnp.max(jnp.abs(values) @ jnp.abs(weights))
     return jnp.max(jnp.abs(values[0])), 2 * effect + rounding
 
 
 def judged_by(error: Array, family: Family, status: Array) -> Array:
-    """The status of a point with that error of its parameter.
+    """The status of a point whose parameter has this error.
 
     DEGENERATE in place of OK where the equations hold and do not determine the parameter.
     """
@@ -486,10 +488,10 @@ def _rounding(u: Array, matrix: Array) -> Array:
 
 
 def _determined(u: Array, value: Array, matrix: Array) -> tuple[Array, Array]:
-    """Equations whose next Newton step leaves the parameter unchanged where they do not determine
-    it.
+    """The equations; where they do not determine the parameter, changed so that the next Newton
+    step leaves it unchanged.
 
-    That is where they hold and the matrix is singular.
+    They do not determine it where they hold and the matrix is singular.
     """
     fails = ~(_rounding(u, matrix) < DETERMINED) & jnp.all(jnp.abs(value) < HOLDS)
     own = matrix.at[:, -1].set(0.0)

@@ -2,13 +2,13 @@
 
 The arc before the stick phase meets the boundary tangentially, r = 0 and x2' = 0, which for a law
 without a jump is the point of slip onset. That arc is followed backwards from the point of
-tangency, so trial solutions cannot overshoot; that it meets its entry is one more equation. Both
-kinds are this same event. They differ in the multiplier m of the cycle at the point with that stick
-arc left out. The return map has slope 0 where the cycle sticks and slope m where it does not: for m
-> 1 both its fixed points lie on one side and vanish together (fold); for m < 1, one lies on either
-side, and the cycle continues (grazing). A cycle with another stick phase has m = 0. Where the law
-jumps, static > mu(0+), the stick phase that begins at the tangency has a positive duration, and
-without it the orbit is another one: the return map jumps, m = inf, and the cycle ends there.
+tangency, so trial solutions cannot overshoot; that it arrives at its entry is one more equation.
+Both kinds are this same event. They differ in the multiplier m that the cycle has at the point if
+that stick phase is left out. The return map has slope 0 where the cycle sticks and slope m where it
+does not: for m > 1 both its fixed points lie on one side and vanish together (fold); for m < 1, one
+lies on either side, and the cycle continues (grazing). A cycle with another stick phase has m = 0.
+Where the law jumps, static > mu(0+), the stick phase that begins at the tangency has a positive
+duration, and an orbit without it differs: the return map jumps, m = inf, and the cycle ends there.
 
 The paper's cycles end with a nonsmooth fold (its section 3); grazing-sliding is the name of M. di
 Bernardo, C. Budd, A. Champneys, P. Kowalczyk, Piecewise-smooth Dynamical Systems, 2008.
@@ -47,9 +47,9 @@ from .systems import (
     stick_phase_from,
 )
 
-#: Distance from an equilibrium at which its unstable manifold begins to be followed: the error is
-#: about the third power of it over the velocity at which the friction law bends, 1/p3 for Conti's
-#: law. With 1e-4 the limit of class (b) at nu1 = -0.2839 is off by 5e-12, with 1e-5 by no more than
+#: Distance from an equilibrium from which on its unstable manifold is followed: the error is about
+#: its third power, divided by the velocity at which the friction law bends, 1/p3 for Conti's law.
+#: With 1e-4 the limit of class (b) at nu1 = -0.2839 is off by 5e-12, with 1e-5 by no more than
 #: 1e-14.
 DEPARTURE = 1e-5
 #: Integration steps for each arc of that orbit; it takes long to leave.
@@ -57,9 +57,10 @@ DEPARTURE_STEPS = 48
 
 
 class Encounter(CycleSystem):
-    """Two belts have one velocity; if they are the same belt, an arc is tangent to its boundary.
+    """Two belts have one velocity; if `belts` is one belt twice, an arc is tangent to its boundary.
 
-    row: of the stick phase that begins at the tangency, else -1; wanted: see `AbstractTangency`.
+    row: first arc of the stick phase that begins at the tangency, -1 if there is none; wanted: see
+    `AbstractTangency`.
     """
 
     chain: Chain
@@ -73,19 +74,18 @@ class Encounter(CycleSystem):
 
     @property
     def is_tangency(self) -> Array:
-        """Whether an arc is tangent to the boundary of the one belt."""
+        """Whether the condition is a tangency, not two equal velocities."""
         return self.belts[0] == self.belts[1]
 
     def _other_phases(self, osc: Oscillator) -> Array:
-        """The arcs of the stick phases that do not begin at the tangency."""
+        """Mask, [arcs], of the stick phases that do not begin at the tangency."""
         others = self.chain.used & ~stick_phase_from(osc, self.chain, self.row)
         return others & jnp.any(self.chain.codes == 0, axis=-1)
 
     def judge(self, osc, z, cycle, slope):
-        slope = jnp.where(z[self.row, 2] > 1e-6, jnp.inf, slope)  # sqrt(rounding) is no phase
+        slope = jnp.where(z[self.row, 2] > 1e-6, jnp.inf, slope)  # below: sqrt(rounding)
         slope = jnp.where(jnp.any(self._other_phases(osc)), 0.0, slope)
-        # A tangency is of one kind.
-        # the slope may be infinite
+        # A tangency is a fold if slope > 1, else grazing. The slope may be inf, and 0 * inf is NaN.
         is_wanted = (self.wanted == 0) | (self.wanted * (slope - 1) >= 0)
         fits = ~self.is_tangency | is_wanted
         status = first_failure(cycle.status, fits, Status.OTHER_KIND)
@@ -95,7 +95,7 @@ class Encounter(CycleSystem):
         sticks = self._other_phases(osc)
         slope = jnp.where(jnp.any(sticks), 0.0, slope)
         nearest, stuck = nearest_contacts(osc, self.chain, z, sticks)
-        # An exchange ends where the stick phase vanishes.
+        # A sliding exchange ends where its stick phase vanishes.
         tests = contact_tests("DoubleSliding", nearest, stuck | self.is_tangency)
         alone = self.is_tangency & ~jnp.any(sticks)
         tests["FoldGrazing", ()] = jnp.where(alone, slope - 1, jnp.nan)
@@ -150,12 +150,13 @@ class AbstractTangency(AbstractStickCondition):
         return [None, *(one.loop for one in cycles)]
 
     def limit(self, trail):
-        """The end of the curve at a belt at rest.
+        """The end of the curve where a belt comes to rest.
 
         No cycle exists in the limit: slip onset on the belt meets an equilibrium, which the orbit
-        takes ever longer to leave. Of its two unstable directions the stronger one wins, by the
-        power 1 - weak/strong of the velocity. So in the limit the orbit along that direction is
-        tangent to the boundary, which is a regular problem.
+        takes ever longer to leave. Of the two unstable directions of the equilibrium the stronger
+        one wins: the part along the weaker one goes like the power 1 - weak/strong of the velocity.
+        So in the limit the orbit along the stronger direction is tangent to the boundary, which is
+        a regular problem.
         """
         stopping = trail.stopping()
         if stopping is None:
@@ -163,7 +164,7 @@ class AbstractTangency(AbstractStickCondition):
         held, free = stopping.held, trail.values[:, 1 - stopping.held]
         guess = extrapolated_to_zero(stopping.velocities, free)
         belts = jnp.asarray(stopping.belt), jnp.asarray(self.belt)
-        # A cycle begins at the end of its longest stick phase, which is the one on that belt.
+        # The chain begins at the end of its longest stick phase, the one on the stopping belt.
         codes = jnp.asarray(np.asarray(trail.system.chain.codes)[0])
 
         def attempt(family, unknowns):
@@ -225,7 +226,7 @@ class GrazingSliding(AbstractTangency):
 def _nearly_closed(osc: Oscillator, orbit: Orbit, belt: Array, size: int) -> tuple[Loop, Array]:
     """A loop near the cycle, from the orbit after a stick phase, and a status.
 
-    Either a cycle was found, or the orbit left the boundary for good: then its first loop from slip
+    Either the orbit repeats, or it has left the boundary for good: then its first loop, from slip
     onset to the next extremum of x2 on that side, closed there, is near the cycle.
     """
     n = len(osc.belts)
@@ -235,8 +236,8 @@ def _nearly_closed(osc: Oscillator, orbit: Orbit, belt: Array, size: int) -> tup
     rows = jnp.arange(HINT_BUDGET)
     near = (orbit.ends == Ends(n).extremum_x2) & (exits[:, 1] * jnp.sign(velocity) > 0) & (rows > 0)
     last = jnp.argmax(near)
-    # The row of the stick phase is left out. From an edge on which slip onset lies the orbit begins
-    # with slip, and that arc is part of the loop.
+    # Row 0, the end of the stick phase, is left out. Where slip onset lies on an edge the orbit
+    # begins with slip, and row 0 is part of the loop.
     before = jnp.where(jnp.any(orbit.codes[0] == STUCK), 0, -1)
     first_loop = eqx.tree_at(lambda o: (o.repeats, o.count), orbit, (before, last + 1))
     returns = jnp.any(near) & ~jnp.any(
@@ -249,10 +250,10 @@ def _nearly_closed(osc: Oscillator, orbit: Orbit, belt: Array, size: int) -> tup
 
 
 def _with_stick(osc: Oscillator, loop: Loop, belt: int | Array) -> tuple[Loop, Array, Array]:
-    """A loop with a stick arc on the belt, its row, and whether there is one.
+    """A loop with a stick arc on the belt, the row of that arc, and whether there is one.
 
-    The loop's own stick arc that begins most nearly by a tangency, or one of duration zero where x2
-    comes closest to the boundary from inside.
+    It is the stick arc of the given loop that begins most nearly by a tangency. If there is none,
+    an arc of duration zero is inserted where x2 comes closest to the boundary from inside.
     """
     velocity = velocity_of(osc, belt)
     rows = jnp.arange(loop.ends.size)
@@ -316,7 +317,7 @@ def _tangent_departure(family: Family, codes, resting, touched, guess: Array):
         belts, either = jnp.stack([touched, touched]), jnp.zeros(())
         return Encounter(chain, belts, jnp.asarray(-1), either)
 
-    closing = 3 * rows[-1] + jnp.arange(2)  # replaced by the beginning of the orbit
+    closing = 3 * rows[-1] + jnp.arange(2)  # the two closing equations, replaced by the beginning
 
     def begins(z, p):
         return z[0, :2] - _departure(osc_at(p), codes, resting)
@@ -341,13 +342,13 @@ def _departure(osc: Oscillator, codes: Array, belt: Array) -> Array:
 
     With x2' = -(x1 - rest) + trace x2 + bend x2^2 and eigenvalues strong > weak, whose product is
     one, x1 - rest = weak x2 - weak bend / (2 strong - weak) x2^2 is invariant to third order. NaN
-    where they are negative, as nothing departs then, and where they are complex, a +- i b: the
-    orbit turns back to the belt within half a loop, on a cycle with -exp(pi a/b) times the belt's
-    velocity as its smallest x2. It shrinks with that velocity, so it touches nothing else, and no
-    curve of tangencies to another belt ends here.
+    where the eigenvalues are negative, as nothing departs then, and where they are complex,
+    a +- i b: the orbit turns back to the belt within half a loop, on a cycle whose smallest x2 is
+    -exp(pi a/b) times the belt's velocity. This cycle shrinks with that velocity, so it touches
+    nothing else, and no curve of tangencies to another belt ends here.
 
     Where the law of the belt jumps, slip onset is not at that equilibrium, and the state is one
-    shortly after it: x2' is the jump.
+    shortly after slip onset, where x2' is the jump.
     """
     mode, zero = mode_of(codes), jnp.zeros(())
     rest = mode_acceleration(osc, mode, zero, zero)

@@ -34,11 +34,11 @@ from ..model.oscillator import Oscillator, at_time
 from ..results import Status
 from .systems import PARTS_OF_ARC, AbstractChainSystem, Seen, Tests
 
-#: A multiplier that is off by less is the one that the condition asks for.
+#: A multiplier that is off by less is the one that the condition requires.
 ON_CIRCLE = 1e-6
-#: Motions are symmetric up to this part of their size.
+#: Motions count as symmetric up to this error, relative to their size.
 SYMMETRIC = 1e-8
-#: A motion comes to a boundary, and does not only touch it, if r goes to zero faster (own units).
+#: A motion arrives at a boundary, and does not only touch it, if |r'| is larger (own units).
 ARRIVES = 1e-6
 
 
@@ -46,7 +46,7 @@ class TimedSystem(AbstractChainSystem):
     """A condition on a periodic motion; the unknowns are those of the motion, [N, 4]."""
 
     def condition(self, osc: Oscillator, z: Array) -> Array:
-        """What vanishes there."""
+        """The expression that vanishes at a solution."""
         raise NotImplementedError
 
     def condition_and_slopes(self, osc_of: Any, z: Array, p: Array) -> Any:
@@ -82,7 +82,7 @@ class TimedSystem(AbstractChainSystem):
         return {(kind, ()): value for kind, value in unit_circle_tests(motion).items()}
 
     def tests_anywhere(self, osc: Oscillator, x: Array) -> Tests:
-        """Those that have values at solutions at which the motion does not exist, too."""
+        """Functions to watch that have values even at solutions that are not admissible motions."""
         return {}
 
     def motion(self, osc: Oscillator, x: Any) -> PeriodicMotion:
@@ -95,7 +95,7 @@ class TimedSystem(AbstractChainSystem):
         return place_of_motion(self.motion(osc, x))
 
     def remeshed(self, osc, x):
-        # The mesh has been refined, and will be once more.
+        # The mesh has been cut by `refined`, and will be once more.
         size = self.chain.mesh.shape[-1] // PARTS_OF_ARC
         chain = self.chain
         chain, _ = timed_chain(osc, chain.loop(x), size, chain.turns, chain.share)
@@ -107,9 +107,9 @@ class TimedSystem(AbstractChainSystem):
 
 
 class OnUnitCircle(TimedSystem):
-    """weights[0] + weights[1] trace + weights[2] determinant of the monodromy matrix vanishes.
+    """parts[0] + parts[1] trace + parts[2] determinant of the monodromy matrix vanishes.
 
-    weights: (1, 1, 1) a multiplier -1, (1, -1, 1) a multiplier 1, (-1, 0, 1) a determinant of 1.
+    parts: (1, 1, 1) a multiplier -1, (1, -1, 1) a multiplier 1, (-1, 0, 1) a determinant of 1.
     """
 
     chain: TimedChain
@@ -142,7 +142,7 @@ class OnUnitCircle(TimedSystem):
         return {
             ("PeriodDoubling", ()): on(on_fold, multipliers["PeriodDoubling"]),
             ("Fold", ()): on(on_doubling, multipliers["Fold"]),
-            # On other curves than that of a torus both multipliers are real, and equal there.
+            # Off torus curves one multiplier is 1 or -1: det = 1 where the other one equals it.
             ("Resonance1to1", ()): jnp.where(on_torus, trace - 2, on(on_fold, det - 1)),
             ("Resonance1to2", ()): jnp.where(on_torus, trace + 2, on(on_doubling, det - 1)),
             ("Resonance1to3", ()): on(on_torus, trace + 1),
@@ -150,7 +150,7 @@ class OnUnitCircle(TimedSystem):
         }
 
     def judge(self, osc, motion):
-        # -1 or 1 where the trace counts; else a pair.
+        # A multiplier -1 or 1 if parts[1] is not 0, else a complex pair.
         wanted = jnp.where(self.parts[1] > 0, -1.0, 1.0)
         found = motion.multipliers
         is_there = jnp.min(jnp.abs(found - wanted.astype(complex))) < ON_CIRCLE
@@ -160,12 +160,12 @@ class OnUnitCircle(TimedSystem):
 
 
 class OnBreakingSymmetry(OnUnitCircle):
-    """A symmetric motion has a multiplier 1, in a direction in which it is symmetric no longer.
+    """A symmetric motion has a multiplier 1, whose direction breaks the symmetry.
 
-    Where symmetric and asymmetric motions meet the equations of a motion are singular, and those of
-    a symmetric one are not: the last mismatch along `direction`, which vanishes by symmetry, gives
-    way to how asymmetric the motion is, along it. direction: in which asymmetric motions leave,
-    about, [2].
+    Where symmetric and asymmetric motions meet, the equations of a motion are singular; those of a
+    symmetric motion are not: of the last mismatch the component along `direction`, which vanishes
+    by symmetry, is replaced by that of the asymmetry. direction: approximate direction of the state
+    in which asymmetric motions leave, [2].
     """
 
     direction: Array
@@ -190,8 +190,8 @@ class OnBreakingSymmetry(OnUnitCircle):
         return first_failure(super().judge(osc, motion), fits, Status.OTHER_KIND)
 
     def _change_of_asymmetry(self, osc: Oscillator, z: Array) -> Array:
-        """How asymmetric motions become in the direction of the multiplier 1, over how far their
-        start moves: 2 where asymmetric motions leave, 0 in a fold of symmetric ones."""
+        """Change of the asymmetry in the direction of the multiplier 1, relative to that of the
+        start: 2 where asymmetric motions leave, 0 in a fold of symmetric ones."""
         maps = arc_maps(osc, self.chain, z)
 
         def times(moved, one):
@@ -215,7 +215,7 @@ class OnBreakingSymmetry(OnUnitCircle):
 
 
 class Touching(TimedSystem):
-    """r = 0 at the end of the arc `row`, at which r' = 0."""
+    """r = 0 at the end of the arc `row`, which is an extremum: r' = 0."""
 
     chain: TimedChain
     row: Array
@@ -228,10 +228,10 @@ class Touching(TimedSystem):
 
 
 class AtLimit(TimedSystem):
-    """The force that stuck belts need is what they can hold at the end of the arc `row`.
+    """The needed force of stuck belts equals their capacity at the end of the arc `row`.
 
-    codes: of the mode in which they stick; rises: 1 where that force is to rise there, -1 where it
-    is to fall, 0 where it may do either.
+    codes: contact codes of the mode in which they stick; rises: 1 if the size of the needed force
+    has to rise there, -1 if it has to fall, 0 for either.
     """
 
     chain: TimedChain
@@ -245,7 +245,7 @@ class AtLimit(TimedSystem):
         return jnp.abs(mode_acceleration(now, mode, y[0], y[1])) - capacity(now, mode)
 
     def tests_anywhere(self, osc, x):
-        # Where the force neither rises nor falls crossing turns into switching.
+        # Where the needed force neither rises nor falls, crossing turns into switching.
         rate, arrives_at = self._rate(osc, x), self.chain.ends[self.row]
         turns_into = {"SwitchingSliding": self.rises > 0, "CrossingSliding": self.rises < 0}
         return {
@@ -255,13 +255,13 @@ class AtLimit(TimedSystem):
         }
 
     def _rate(self, osc: Oscillator, z: Array) -> Array:
-        """How fast the force rises."""
+        """Rate of change of |needed force| - capacity."""
         at = guards_trend(osc, mode_of(self.codes), z[self.row + 1])
         return -jnp.where(at.value[-2] < at.value[-1], at.slope[-2], at.slope[-1])
 
     def judge(self, osc, motion):
         y, rises = motion.unknowns[self.row + 1], self._rate(osc, motion.unknowns)
-        # A motion that only touches the boundary it arrives at grazes.
+        # A motion that only touches the boundary grazes it, which is another condition.
         codes, end = motion.chain.codes[self.row], motion.chain.ends[self.row]
         arrives = (self.rises == 0) | (guard_slope(osc, codes, end, y) < -ARRIVES)
         fits = (self.rises * rises >= 0) & arrives
@@ -269,7 +269,7 @@ class AtLimit(TimedSystem):
 
 
 def unit_circle_tests(motion: PeriodicMotion) -> dict[str, Array]:
-    """Functions that vanish where multipliers meet the unit circle, by the kind of the point."""
+    """Functions that vanish where multipliers cross the unit circle, by the kind of the point."""
     trace, det = _trace_and_determinant(motion)
     is_pair = jnp.imag(motion.multipliers[0]) != 0
     torus = jnp.where(is_pair, det - 1, jnp.nan)
@@ -277,8 +277,8 @@ def unit_circle_tests(motion: PeriodicMotion) -> dict[str, Array]:
 
 
 def asymmetry(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
-    """The sum of the states where a chain of an odd number of periods begins and half of its time
-    later, [2]: zero of a motion that is its own image under x1 -> -x1, half of its time later."""
+    """Sum of the states at the beginning of a chain of an odd number of periods and half of its
+    duration later, [2]; zero if the motion is its own image under x1 -> -x1, half of it later."""
     share = jnp.zeros(()) if chain.share is None else chain.share
     later = states_at_phase(osc, chain, z, (share + 0.5) % 1.0)
     passes = ~jnp.isnan(later[:, 0])
@@ -289,7 +289,7 @@ def asymmetry(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
 
 
 def _trace_and_determinant(motion: PeriodicMotion) -> tuple[Array, Array]:
-    """Of the monodromy matrix."""
+    """Trace and determinant of the monodromy matrix, from the multipliers."""
     return jnp.real(jnp.sum(motion.multipliers)), jnp.real(jnp.prod(motion.multipliers))
 
 

@@ -1,8 +1,8 @@
-"""The system of equations along a curve of bifurcation points, and the special points on its way.
+"""The system of equations along a curve of bifurcation points, and the special points on the curve.
 
 A `Track` is the system of a condition with both parameters among its unknowns. Between two points
-of it the watched functions may change their signs: where one does, `special_between` solves for its
-zero, a point of codimension two; zeros on points of it are those of `special_on`.
+of the curve a watched function may change its sign: then `special_between` solves for its zero, a
+point of codimension two. `special_on` finds zeros that lie exactly on a point of the curve.
 """
 
 from collections.abc import Callable
@@ -21,13 +21,13 @@ from .base import BifurcationPoint
 from .special import SpecialPoint, extrapolated_to_zero
 from .systems import AbstractSystem, Seen
 
-#: How often, at most, the points on both sides of a singular one are brought nearer to it by half.
+#: How often, at most, the points on both sides of a singular point are moved half of the way to it.
 #: Newton's method fails earlier: after four times in the known cases, where two times leave 5e-9.
 SHRINKS = 8
-#: A watched function that is larger than this fraction of its values before and after where it
-#: changes its sign jumps there, and does not vanish. Zeros of square roots leave 1e-7.
+#: A watched function that changes its sign where it is larger than this fraction of its values at
+#: both ends of the step jumps there, and does not vanish. Zeros of square roots leave 1e-7.
 JUMPS = 1e-3
-#: A function that is smaller at both ends of a step is zero all along it, up to rounding.
+#: A function that is smaller than this at both ends of a step is zero all along it, up to rounding.
 ALONG = 1e-12
 
 
@@ -40,15 +40,15 @@ def corrected_among(
     tangent: ArrayLike,
     length: float,
 ) -> Corrected:
-    """As `continuation.corrected`, among the oscillators of a variation.
+    """As `continuation.corrected`, for equations of the oscillators of a variation.
 
-    linearized, args: of these, behind the family. units: of the parameters, [k], which are the last
-    of the unknowns u.
+    linearized: called with (family, *args) as its args. units: of the parameters, [k], which are
+    the last k of the unknowns u.
     """
     start, normal, k = np.asarray(u), np.asarray(tangent), len(units)
 
     def attempt(family, unknowns):
-        # In the same plane: the first guess of u is `length` ahead, the others lie in it.
+        # Every attempt solves in one plane, `length` ahead of the start; later guesses lie in it.
         ahead = length if unknowns[0] is start else 0.0
         solved = corrected(linearized, (family, *args), unknowns[0], normal, ahead)
         return solved, (solved.u, units * solved.u[-k:])
@@ -59,7 +59,7 @@ def corrected_among(
 
 
 class Track(NamedTuple):
-    """The system of a curve in the unknowns u: its own, weighted, and both parameters."""
+    """The system of a curve, in u: its own unknowns times weights, and both parameters."""
 
     variation: Variation
     system: AbstractSystem
@@ -69,7 +69,7 @@ class Track(NamedTuple):
     def begun(
         cls, variation: Variation, point: BifurcationPoint, pair: np.ndarray
     ) -> tuple["Track", np.ndarray]:
-        """The system to follow from a point, and u there; pair: both parameters."""
+        """The track to follow from a point, and u there; pair: both parameters, [2]."""
         system, x = point.condition.applied_to(point.oscillator).system_at(point)
         weights = system.weights(jnp.asarray(x))
         u = np.append(np.asarray(weights) * np.asarray(x).reshape(-1), pair)
@@ -89,7 +89,7 @@ class Track(NamedTuple):
         return self.system.place(self.variation.oscillator(u[-2:]), self.unknowns(u))
 
     def seen_at(self, u: np.ndarray) -> Seen:
-        """What is seen at a solution, in numbers."""
+        """`AbstractSystem.seen_at` at u, in Python numbers."""
         osc, x = self.variation.oscillator(u[-2:]), jnp.asarray(self.unknowns(u))
         seen = _seen_at(osc, self.system, x)
         tests = {name: float(value) for name, value in seen.tests.items()}
@@ -104,10 +104,11 @@ class Track(NamedTuple):
         return Track(self.variation, system, weights), scale * u, scale * tangent
 
     def tangent(self, u: np.ndarray) -> np.ndarray:
-        """Direction of the curve at u, in the sense in which a parameter grows."""
+        """Tangent of the curve at u along which the first parameter grows, or the second one where
+        the curve turns back in the first."""
         for axis in (-2, -1):
             solved = self.corrected(u, np.eye(u.size)[axis], 0.0)
-            if solved.found:  # not found where the curve turns back in this parameter
+            if solved.found:  # fails where the curve turns back in this parameter
                 break
         return solved.tangent
 
@@ -137,7 +138,7 @@ def special_between(
     before: tuple[CurvePoint, Seen],
     after: tuple[CurvePoint, Seen],
 ) -> list[SpecialPoint]:
-    """Points of codimension two between two neighbours: zeros of watched functions."""
+    """Points of codimension two between two neighbouring points: zeros of watched functions."""
     from scipy.optimize import brentq  # half a second that only curves need
 
     (a, seen_a), (b, seen_b) = before, after
@@ -145,7 +146,7 @@ def special_between(
     found = []
     for name, start in seen_a.tests.items():
         end = seen_b.tests.get(name, np.nan)
-        # A zero on a row is one of `special_on`.
+        # A zero at an end of the step is found by `special_on`.
         if np.isnan(start * end) or start * end >= 0 or min(abs(start), abs(end)) < ALONG:
             continue
 
@@ -158,7 +159,7 @@ def special_between(
             return _Probe(part, value, at.u[-2:], max(seen.residual, abs(value)))
 
         try:
-            # Beside a singular point the solution at an end may be on the other side.
+            # Beside a singular point the solution for an end may lie on the point's other side.
             if probe(0.0).test * probe(1.0).test > 0:
                 raise _SingularError
             root: Any = brentq(lambda part, probe=probe: probe(part).test, 0.0, 1.0, xtol=1e-14)
@@ -184,10 +185,10 @@ def special_on(
     before: tuple[CurvePoint, Seen] | None = None,
 ) -> list[SpecialPoint]:
     """Points of codimension two on a row: watched functions that vanish there, and have different
-    signs so far on both sides of it.
+    signs on its two sides.
 
-    aside: how far from it they are looked at. before: the row before; what vanishes there, too,
-    does so all along the curve.
+    aside: distance along the curve at which the signs are compared. before: the row before; a
+    function that vanishes there, too, vanishes all along the curve.
     """
     at, seen = row
     if not np.all((limits[:, 0] <= at.u[-2:]) & (at.u[-2:] <= limits[:, 1])):
@@ -208,9 +209,9 @@ def special_on(
 
 
 def _vanishes_at_rest(point: SpecialPoint, points: list[SpecialPoint]) -> bool:
-    """Whether a point is one of these points where a belt comes to rest.
+    """Whether a point only repeats one of `points` at which a belt comes to rest.
 
-    Distances of a cycle from others vanish with the belt's velocity.
+    Distances of the cycle from boundaries and edges vanish with the belt's velocity.
     """
     if point.kind not in ("DoubleSliding", "EdgeTouch"):
         return False
@@ -219,7 +220,7 @@ def _vanishes_at_rest(point: SpecialPoint, points: list[SpecialPoint]) -> bool:
 
 
 class _Probe(NamedTuple):
-    """A part of a step, with the watched function, the parameters and the largest error there."""
+    """A fraction of a step, with the watched function, parameters [2] and largest error there."""
 
     part: float
     test: float
@@ -232,10 +233,11 @@ class _SingularError(Exception):
 
 
 def _from_both_sides(probe: Callable[[float], _Probe], low: _Probe, high: _Probe) -> _Probe:
-    """Zero of a function that has no value there: extrapolated from values on both sides.
+    """Zero of a watched function at a point where it cannot be computed, extrapolated from values
+    on both sides.
 
-    An example is a curve whose cycle shrinks to a point: with all arcs of duration zero its
-    equations are singular.
+    An example is a curve whose cycle shrinks to a point: with all arcs of duration zero the
+    equations of the cycle are singular.
     """
     known = [low, high]
     for _ in range(SHRINKS):

@@ -1,16 +1,16 @@
-"""Lanes whose oscillators know the time: their starts and steps; `timed_events` has their events.
+"""Lanes of oscillators with a clock: their starts and steps; `timed_events` has their events.
 
-Beside `step`, `events` and `rounds`, which are for oscillators without a clock, for three reasons.
-Where x2' = 0 the next derivative is not -x2, boundaries may move, and stick phases are not over in
-closed form. So a step asks each guard of its mode by its control points, see `control_points`,
-whether it may vanish; and a mass that sticks is stepped as well, its stages on the belt's course,
-where their x2' is the force that the belts have to hold. A step has the derivatives of the motion
-at a fixed time; those of events are not in it.
+`step`, `events` and `rounds` are for oscillators without a clock. They do not serve here, for three
+reasons: where x2' = 0 the next derivative is not -x2, boundaries may move, and stick phases do not
+end in closed form. So a step tests by the control points of each guard of its mode, see
+`control_points`, whether the guard may vanish. A mass that sticks is stepped as well: its stages
+follow the belt, and their x2' is the force that the stuck belts have to hold. A step has the
+derivatives of the motion at a fixed time; those of event times are not in it.
 
-The guards are numbered as in `instants.guards_at`. Of boundaries and edges the values and slopes at
-both ends of a step and the integral are known, as in `step`: these make a polynomial. What stuck
-belts have to hold is known at the times of the stages to the last bits, and so is a polynomial of
-degree eight.
+Guards are numbered as in `instants.guards_at`. Boundary and edge guards are polynomials through
+their values and slopes at both ends of a step, with the right integral, as in `step`. The force
+that stuck belts have to hold is known at the times of the stages to the last bits, and is taken as
+a polynomial of degree eight.
 """
 
 import functools
@@ -65,40 +65,40 @@ from .step import (
 )
 from .waves import StepClock, StepWave
 
-#: Longest step of a mass that sticks, times the highest frequency: the polynomial of what is needed
-#: is then good to 1e-9, and steps that end at its root are made again.
+#: Longest step of a mass that sticks, times the highest frequency: the polynomial of the needed
+#: force is then good to 1e-9, and steps are made again to end at its root.
 LONGEST_STUCK = 1.2
-#: Rounding of boundaries and edges, over their size.
+#: Relative rounding error of boundary and edge guards.
 GUARD_DOUBT = 1e-15
-#: Steps shorter than this have their polynomials from values and slopes alone: what the integral
-#: adds is rounding.
+#: In steps shorter than this, polynomials are made of values and slopes alone: the integral would
+#: add only rounding.
 SHORT_TIMED_STEP = 1e-3
-#: No step is asked twice below this one, over the time that a Taylor step bridges.
+#: Steps shorter than this, over the longest time that a Taylor step bridges, are not cut for doubt.
 SHORTEST_TIMED_STEP = 1e-4
 #: A step that would be shortened to more than this share of itself is halved.
 NO_SHORTER = 0.99
-#: Of the highest coefficient of what is needed, how far the polynomial may be off.
+#: Error of the polynomial of the needed force, over its highest coefficient.
 LAST_TERM = 1e-4
-#: Error of the time of slip onset that needs no shorter step, over `LANDS_WITHIN` of the tolerance.
+#: Largest error of an onset time that needs no shorter step, over `LANDS_WITHIN` * tolerance.
 STRAIGHT_GUARD = 1.0
-#: The stages, by their number, whose times make the polynomial of what is needed, beside the
-#: start, 0: of all of them the rounding would be a thousand times as large.
+#: Numbers of the stages that, with the start (0), are the nodes of the polynomial of the needed
+#: force; with all stages as nodes its rounding would be a thousand times as large.
 TIMED_STAGES = (2, 6, 4, 7, 8, 9, 10, 13)
 
 
 def of_lanes(function: Callable, osc: Oscillator, *args: Any) -> Any:
-    """What a function of an oscillator and more gives, lane by lane."""
+    """function(osc, *args) lane by lane; leaves of `osc` that are scalars serve all lanes."""
     axes = jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, osc)
     return jax.vmap(function, in_axes=(axes, *(0 for _ in args)))(osc, *args)
 
 
 def needed_or_rate(osc: Oscillator, mode: Mode, t: Array, x1: Array, x2: Array) -> Array:
-    """x2' of lanes that slip; of lanes that stick, what is needed."""
+    """x2' of lanes that slip; the needed force of lanes that stick."""
     return mode_acceleration(at_time(osc, t), mode, x1, x2)
 
 
 def timed_lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, t0: Any) -> Lanes:
-    """Lanes at the start of their runs, at the time t0, without what an observer adds."""
+    """Lanes at the start of their runs, at the time t0, without memory and integrals."""
     t = jnp.zeros_like(x1) + t0
 
     def start(osc, x1, x2, t):
@@ -112,7 +112,7 @@ def timed_lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, t0: Any) ->
     status = jnp.where(forever, Status.STUCK_FOREVER.value, Status.OK.value)
     a = needed_or_rate(osc, mode, t, x1, x2)
     lanes = lanes_in(mode, a, finite, rests, status, run, x1, x2, passes, rtol)
-    # A steady stick phase is asked for its end before the first step.
+    # Negative, as after a landing: `timed_events` finds the end of a steady stick phase first.
     h = jnp.where(mode.any_stuck, -lanes.h, lanes.h) if is_steady(osc) else lanes.h
     return replace(lanes, t=t, h=h, hit=lanes.events - 1, until=jnp.full_like(t, jnp.inf))
 
@@ -120,8 +120,9 @@ def timed_lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol, t0: Any) ->
 class TimedWindow(eqx.Module):
     """What does not change until the next event, arrays [lanes].
 
-    signs: of the mode; stuck, active: lanes that stick, that are to be stepped; longest: their
-    longest step; edges: (left, right), where the mode ends, and their numbers; None: no edges.
+    signs: of the mode; stuck: lanes that stick; active: lanes that are to be stepped; longest: the
+    longest step; edges: (left, right), where the mode ends; numbers: of their guards; None: no
+    edges.
     """
 
     signs: tuple[Array, ...]
@@ -162,8 +163,8 @@ def timed_window_of(osc: Oscillator, lanes: Lanes, *, extrema: Array | None = No
 
 
 class _TimedAttempt(eqx.Module):
-    """A step of size h, not yet accepted, as `step._Attempt`; rate: x2' at the end, of lanes that
-    stick the belt's; needed: what stuck belts have to hold, at the start and at `TIMED_STAGES`."""
+    """A step of size h, not yet accepted, as `step._Attempt`; rate: x2' at the end, in lanes that
+    stick the belt's; needed: the needed force at the start and at `TIMED_STAGES`."""
 
     h: Array
     x1: Array
@@ -217,7 +218,7 @@ def _timed_attempt(
 
 
 def _least_share(osc: Oscillator, lanes: Lanes, clock: StepClock, rise, a_end, rtol) -> Array:
-    """The least `share_of_tolerance` of the motions relative to the belts."""
+    """The least `share_of_tolerance`, of x2 and of x2 relative to each moving belt."""
     shares = [share_of_tolerance(rise, lanes.a, a_end, rtol)]
     for wave in clock.velocities:
         if isinstance(wave, StepWave):
@@ -233,7 +234,7 @@ def _moves(now: Oscillator) -> bool:
 
 
 def rate_of_stick(now: Oscillator, mode: Mode) -> Array:
-    """The acceleration of the belts that are stuck to, over omega; 0 where none is."""
+    """Acceleration of the belt that the mass sticks to, over omega; 0 where it slips."""
     zero = jnp.zeros_like(mode.codes[0])
     if not _moves(now):
         return zero
@@ -242,10 +243,10 @@ def rate_of_stick(now: Oscillator, mode: Mode) -> Array:
 
 
 class _GuardMeeting(eqx.Module):
-    """What a step has to do with one guard.
+    """How a step meets one guard, arrays [lanes].
 
-    once, cut, there: see `control_points.RootPassage`; delta: the time from the end of the step on
-    to where it vanishes, NEVER where no Taylor step leads there. number: of the guard.
+    once, cut, there: see `control_points.RootPassage`; delta: the time from the end of the step to
+    the root of the guard, NEVER where no Taylor step bridges it. number: of the guard.
     """
 
     once: Array
@@ -255,7 +256,7 @@ class _GuardMeeting(eqx.Module):
     number: Array
 
     def unless(self, passed: Array) -> "_GuardMeeting":
-        """The same; nothing to do where the guard was passed already."""
+        """The meeting, but none in the lanes that have passed the guard already."""
         delta = jnp.where(passed, NEVER, self.delta)
         return replace(self, once=self.once & ~passed, cut=self.cut & ~passed, delta=delta)
 
@@ -263,8 +264,8 @@ class _GuardMeeting(eqx.Module):
 def _meeting(
     curve: Polynomial, doubt, rounding, ends, clock: StepClock, room, reach, number
 ) -> _GuardMeeting:
-    """ends: the guard's (value, slope) at the start and at the end, by the time; room: see
-    `step.LANDS_WITHIN`."""
+    """How a step meets a guard. ends: its (value, time derivative) at the start and at the end;
+    curve, doubt, rounding: see `passage`; reach, room: see `step.LANDING`, `step.LANDS_WITHIN`."""
     (_, slope0), (value, slope) = ends
     h, keep = clock.h, functools.partial(materialise, ones=clock.ones)
     met = passage(curve, doubt, rounding, h < SHORTEST_TIMED_STEP * reach, keep)
@@ -272,7 +273,7 @@ def _meeting(
     falls = slope < 0
     near = jnp.abs(value) * jnp.maximum(-slope, SLOW * jnp.abs(bend)) <= reach * slope * slope
     straight = value * value * jnp.abs(bend) * h <= room * slope * slope
-    # Where it only touches, within rounding, no Taylor step leads to it.
+    # Where the guard only touches zero, within rounding, no Taylor step leads to its root.
     depth = jnp.where(bend > 0, 0.5 * slope * slope / jnp.where(bend > 0, bend, 1.0), jnp.inf)
     near = near & falls & straight & (value - depth < -rounding)
     per_slope = 1.0 / jnp.where(near, slope, 1.0)
@@ -284,13 +285,13 @@ def _meeting(
 
 
 def _per_step(h: Array) -> Array:
-    """1/h of the lanes that make a step: one division serves all guards."""
+    """1/h, and 1 in lanes that make no step: one division serves all guards."""
     return 1.0 / jnp.where(h > 0, h, 1.0)
 
 
 def _quartic(start, end, change, h) -> list[Array]:
-    """Coefficients of a function over a step by (value, slope) at both ends and its integral over
-    the step; `change` is None where that is not known."""
+    """Coefficients of a function over a step, a quartic in theta from 0 to 1, by its (value, time
+    derivative) at both ends and its integral over the step, `change`."""
     (f0, s0), (f1, s1) = start, end
     m0, m1 = h * s0, h * s1
     rise = f1 - f0
@@ -303,7 +304,7 @@ def _quartic(start, end, change, h) -> list[Array]:
 def _meetings(
     osc, clock: StepClock, window: TimedWindow, lanes: Lanes, new: _TimedAttempt, rtol, atol, lands
 ):
-    """What the step has to do with each guard of its mode; lands: see `_limit_of_stick`."""
+    """How the step meets each guard of its mode; lands: see `_limit_of_stick`."""
     h, n, ones = clock.h, len(osc.belts), clock.ones
     reach = LANDING * jnp.sqrt(rtol)
     room = LANDS_WITHIN * (atol + rtol * jnp.abs(new.x2)) * h
@@ -323,7 +324,7 @@ def _meetings(
         wave = [ends[0][0]]
         if _moves(start):
             wave = _quartic(*ends, v.integral(1.0, h), h)
-        # Not where the mode has no such guard: it stays positive there.
+        # Where the belt does not slip, the mode has no such guard: the constant 1 serves instead.
         guard = [w - osc.omega * k for w, k in zip(wave, own)] + [
             -osc.omega * k for k in own[len(wave) :]
         ]
@@ -373,10 +374,10 @@ def _meetings(
 def _limit_of_stick(
     osc, clock: StepClock, window, lanes, new: _TimedAttempt, room, reach, lands: bool
 ) -> _GuardMeeting:
-    """The meeting with a limit of what stuck belts can hold, capacity -+ needed: the nearer one.
+    """How a step meets the nearer limit of stuck belts, capacity - needed or capacity + needed.
 
-    Where it may meet both the step is cut. lands: whether a step always ends near to the root; else
-    one that holds it may be gone back to it, however far that is.
+    Where it may meet both, it is cut. lands: whether a step has to end near the root; else a step
+    that has passed the root may go back to it, however far that is.
     """
     own, n, h = nystroem(), len(osc.belts), clock.h
     nodes = tuple(round(float(own.c[i]), 12) for i in (0, *TIMED_STAGES))
@@ -412,7 +413,7 @@ def _limit_of_stick(
     one = replace(one, cut=one.cut | both, there=jnp.where(both, 0.5 * one.there, one.there))
     if lands or any(isinstance(v, StepWave) for v in clock.velocities):
         return one
-    # The way is straight: the state at the root is as good as that at the end.
+    # x1 is linear in the time: the state at the root is as good as that at the end of the step.
     _, slope, _ = curve.at(one.there)
     sharp = doubt * safe <= STRAIGHT_GUARD * room * jnp.abs(slope)
     back = jnp.where(one.once & ~one.cut & sharp, (one.there - 1) * h, one.delta)
@@ -441,9 +442,9 @@ def take_timed_step(
     h = jnp.minimum(h, to_end)
     clock = StepClock.of(osc, ones, lanes.t, h)
     new = _timed_attempt(osc, clock, window, lanes, rtol, atol, rates)
-    # Integrals are known at the ends of steps, and near to them.
+    # Integrals are known only at the ends of steps, and near them.
     found = _meetings(osc, clock, window, lanes, new, rtol, atol, rates is not None)
-    # The guard at which nothing changed, see `timed_events`.
+    # The guard at which the mode did not change, see `timed_events`, is left out.
     passed = jnp.where(window.stuck, -1, lanes.hit)
     found = [one.unless(one.number == passed) for one in found]
     delta = functools.reduce(jnp.minimum, [one.delta for one in found])
@@ -455,11 +456,11 @@ def take_timed_step(
     theta, cuts = jnp.ones_like(h), no
     for one in found:
         blocks = one.cut | (one.once & (one.delta >= NEVER))
-        # What is shortened has to be shorter, also where rounding has its root at the end.
+        # A shortened step has to be shorter, also where rounding puts the root at its end.
         there = jnp.where(one.there > NO_SHORTER, 0.5, one.there)
         sooner = blocks & (there < theta)
         theta, cuts = jnp.where(sooner, there, theta), cuts | blocks
-        # What stands on a guard at once lands on it.
+        # A lane that stands on the guard at the start of the step lands on it.
         number = jnp.where(sooner & (there * h < NO_STEP), one.number, number)
     blocked = cuts
 

@@ -1,6 +1,6 @@
-"""Events of the lanes: what follows where a step has landed, and what each event is called.
+"""Events of the lanes: how a lane goes on where its step has landed, and what each event is called.
 
-What follows is decided by the rules of `model.modes`; stick phases are passed in closed form. A
+The rules of `model.transitions` decide how it goes on; stick phases are passed in closed form. A
 sequence of events is kept as one number, its word.
 """
 
@@ -31,10 +31,10 @@ def pass_events(
     captures: bool,
     derivatives: bool,
 ) -> tuple[Lanes, Passage]:
-    """Lanes that stand on a guard go on; stick phases are passed to their end, or to t1.
+    """The lanes past the guards that they stand on, and past stick phases, to their end or to t1.
 
     captures: whether a run ends where a pseudo-focus captures it; derivatives: see
-    `step.take_step`, lanes at rest go on then.
+    `step.take_step`; with them, lanes at rest go on.
     """
     landed = (lanes.h < 0) & ~lanes.done
     # A lane may also have landed where x2 = 0, which is no guard.
@@ -99,7 +99,7 @@ def pass_events(
 
 class _Hold(NamedTuple):
     """What a stick phase does to the lanes that are stuck, see `Passage`; mode, x1, x2: after it,
-    for lanes that are not stuck as they were."""
+    unchanged in lanes that are not stuck."""
 
     mode: Mode
     x1: Array
@@ -147,16 +147,16 @@ def _set_off(osc, lanes, mode: Mode, x1, x2, fired, released, rtol) -> tuple[Arr
     a = without_rounding(a, x1)
     h = jnp.where(fired, first_step(rtol), jnp.abs(lanes.h))
     if has_edges(osc):
-        # In a corner one event follows the other at once: a lane that stands on the next guard,
-        # and goes on through it, has landed there.
+        # Where a boundary meets an edge, one event follows the other at once: a lane that stands on
+        # the next guard, and goes on through it, has landed there.
         corner = (fired | released) & ~mode.any_stuck & (guard_passed(osc, mode, x1, x2) >= 0)
         h = jnp.where(corner, -h, h)
     return a, h
 
 
 def event_kinds(lanes: Lanes, passage: Passage) -> tuple[tuple[Array, Array, Array], ...]:
-    """(happened, kind, belt) of the event that ended a step, and of that which ended a stick phase
-    after it."""
+    """(happened, kind, belt) of the event that ended a step, and of the event that ended the stick
+    phase after it."""
     return (
         (passage.fired, *event_between(passage.before.codes, passage.mode.codes)),
         (passage.released, *event_between(passage.mode.codes, lanes.mode.codes)),

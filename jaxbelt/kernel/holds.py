@@ -1,14 +1,14 @@
-"""Stick phases under a clock, to their end, where no belt changes its velocity or its load.
+"""Ends of stick phases under a clock, where no belt changes its velocity or its load.
 
-What the stuck belts have to hold is then a line plus waves of the time since the phase began,
+The needed force is then a line plus waves, in the time tau since the phase began,
 
     needed(tau) = rest - v tau + sum of a_j cos(theta_j + Omega_j tau),
 
 and its second derivative is never larger than bend = sum of |a_j| Omega_j^2. A limit
 f = capacity -+ needed with the slope s therefore stays positive for as long as the parabola
-f + s tau - bend tau^2 / 2 does. The search steps to where the nearer parabola vanishes, and so on:
-it cannot pass an end, whatever the frequencies are, and it comes to a simple root as fast as
-Newton's method. What a limit only touches, within rounding, it steps over.
+f + s tau - bend tau^2 / 2 does. The search steps to where the first of the two parabolas vanishes,
+again and again: it cannot pass an end, whatever the frequencies are, and converges to a simple root
+as fast as Newton's method. It steps over roots where a limit only touches zero, within rounding.
 """
 
 from typing import NamedTuple
@@ -31,22 +31,22 @@ from ..model.modes import (
 from ..model.oscillator import Oscillator, at_time
 from .waves import along_and_across, turn_of
 
-#: Rounding of what is needed, over its size.
+#: Relative rounding error of the needed force.
 NEEDED_ROUNDING = 1e-13
-#: Newton's method is left alone with a root where bend f <= `SAFE` s^2: by Kantorovich's theorem
-#: each step then leaves less than the square of twice that, and `LAST_NEWTON_STEPS` leave rounding.
+#: Newton's method takes over where bend f <= `SAFE` s^2: by Kantorovich's theorem each step then
+#: leaves less than the square of twice bend f / s^2, and `LAST_NEWTON_STEPS` leave rounding.
 SAFE, LAST_NEWTON_STEPS = 1 / 32, 4
-#: Steps of a search; where they do not reach the end, the rest is asked for again.
+#: Steps of one search; where they do not reach the end, the next search goes on from there.
 MOST_PARABOLAS = 64
-#: What may be zero is divided by this, at least.
+#: Least divisor, in place of one that may be zero.
 LEAST_DIVISOR = 1e-300
 
 
 class FirstEnd(NamedTuple):
     """The end of a stick phase, arrays [lanes].
 
-    duration: until its end, or as far as there is none; number: the guard that ends it, as in
-    `instants.guards_at`, -1 where none has been found.
+    duration: until its end, or the time searched without finding one; number: the guard that ends
+    it, as in `instants.guards_at`, -1 where none has been found.
     """
 
     duration: Array
@@ -54,19 +54,19 @@ class FirstEnd(NamedTuple):
 
 
 def is_steady(osc: Oscillator) -> bool:
-    """Whether no belt changes its velocity or load, and all forces are waves; by its structure."""
+    """Whether no velocity or load oscillates and all forces are waves or constants, by type."""
     numbers = [number for belt in osc.belts for number in (belt.velocity, belt.load)]
     waves = all(isinstance(one, ConstantForce | Harmonic | BaseMotion) for one in osc.forcing)
     return waves and not any(isinstance(number, Oscillating) for number in numbers)
 
 
 def hold_from(osc: Oscillator, mode: Mode, asked: Array, x1, x2, t, remaining) -> FirstEnd:
-    """The stick phases of the lanes that are asked for, up to the remaining time.
+    """The ends of the stick phases of the asked lanes, up to the remaining time.
 
     Args:
         osc: Steady oscillators, see `is_steady`.
         mode: Modes with a stuck belt.
-        asked: Lanes to be asked; of the others the answer means nothing.
+        asked: Mask of the lanes to search; the results of the others mean nothing.
         x1: Where the mass is.
         x2: The velocity of the belt that holds it.
         t: Time.
@@ -99,8 +99,8 @@ def hold_from(osc: Oscillator, mode: Mode, asked: Array, x1, x2, t, remaining) -
     horizon = jnp.minimum(remaining, to_edge)
 
     def parabolas(tau):
-        """Of the limit whose parabola vanishes first: how far that is, its side, and whether a
-        simple root of the limit itself is that near."""
+        """The time to the first root of a parabola, the side of its limit, and whether Newton's
+        method is safe to find the root of that limit."""
         needed, rate = needed_at(tau)
         ways, sure = [], []
         for side in (-1.0, 1.0):
@@ -134,7 +134,7 @@ def hold_from(osc: Oscillator, mode: Mode, asked: Array, x1, x2, t, remaining) -
         value, slope = limit + side * needed, side * rate
         way = jnp.where(ends, -value / jnp.where(ends, slope, 1.0), 0.0)
         tau = jnp.maximum(tau + way, 0.0)
-    # Where a limit and an edge are at one place but for rounding, what is beyond the edge decides.
+    # Where a limit and an edge coincide up to rounding, the phase ends at the edge.
     rounding = fuzz / jnp.maximum(jnp.abs(x2), LEAST_DIVISOR)
     at_edge = ~going & (to_edge <= remaining) & (~ends | (to_edge <= tau + rounding))
     at_limit = ends & ~at_edge & (tau <= remaining)
@@ -165,6 +165,6 @@ class _PhaseWave(NamedTuple):
 
 
 def _wave(osc: Oscillator, force, t: Array) -> _PhaseWave:
-    """A force on the mass from the time t on."""
+    """The wave of a force on the mass, in the time tau since t."""
     angle = force.frequency * t + force.phase
     return _PhaseWave(force.amplitude, force.frequency, angle, turn_of(osc, force))

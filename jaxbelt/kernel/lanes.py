@@ -1,7 +1,7 @@
 """Lanes: the state of the runs that one kernel advances together, and the base of its observers.
 
-An `Observer` says what is wanted of a run and when it may end. A `Program` is everything that is
-fixed when the kernel is compiled.
+An `Observer` says which results a run hands in and when it may end. A `Program` is everything that
+is fixed when the kernel is compiled.
 """
 
 import abc
@@ -19,11 +19,11 @@ from ..model.own_units import OwnOscillator
 from ..numerics.compiling import where_any
 from ..numerics.widths import is_cpu
 
-#: Lanes that `in_few` serves at once: of 128 some thirty come to an event between two looks, and as
-#: one force drives them all, at times more; who is not served waits for four steps.
+#: Lanes that `in_few` serves at once: of 128 some thirty come to an event in four steps, and as one
+#: force drives them all, at times more; a lane that is not served waits for the next four steps.
 SERVED = 48
-#: A motion this large grows beyond all bounds. The cube of a velocity above 5.6e102, which Conti's
-#: law takes, is no longer a number; there steps become ever smaller.
+#: Larger states are taken for unbounded growth. Conti's law cubes the velocity, which overflows
+#: above 5.6e102: steps would become ever smaller there.
 GROWN = 1e100
 
 
@@ -34,10 +34,10 @@ class Lanes(eqx.Module):
     began; t, x1, x2, a: time, state and x2'; h: next step size, negative where the lane has landed
     on a bound of its mode and waits for `events.pass_events`; pace: inverse of the largest step
     that the last error would have allowed; mode; events: how many there were; status; done. lower,
-    upper: extrema of x2 since the observer reset them, where it asks for extrema. memory: the
-    observer's. integrals: of the rates that it gives to the steps, see `Observer.follow`, from 0
-    to t. hit: with a clock, the guard that a lane has landed on, as numbered in `instants`, or that
-    its stick phase ends at, or -1; until: the time when that phase ends, see `holds`.
+    upper: extrema of x2 since the observer reset them, where it asks for extrema. memory: of the
+    observer. integrals: of the rates that the observer gives to the steps, see `Observer.follow`,
+    from 0 to t. hit: with a clock, the guard that a lane has landed on, as numbered in `instants`,
+    or that its stick phase ends at, or -1; until: the time when that phase ends, see `holds`.
     """
 
     run: Array
@@ -63,11 +63,11 @@ class Lanes(eqx.Module):
 class Passage(eqx.Module):
     """What one call of `events.pass_events` did to the lanes, arrays [lanes].
 
-    landed: the last step ended on a guard or where x2 = 0. fired: it was a guard, the one of that
-    number, see `guard_passed`; `before` and `mode` are the modes on both sides of it, at
-    (t, x1, x2). captured: by a pseudo-focus. rests: at rest up to rounding. stuck: a stick phase
-    followed, of that duration; released: it ended before t1, by slip onset or at an edge; forever:
-    it never ends.
+    landed: the last step ended on a guard or where x2 = 0. fired: it ended on a guard; number: of
+    that guard, see `guard_passed`; before, mode: the modes on both sides of the guard; t, x1, x2:
+    where it was passed. captured: by a pseudo-focus. rests: at rest up to rounding. stuck: a stick
+    phase followed; duration: of that phase; released: the phase ended before t1, by slip onset or
+    at an edge; forever: it never ends.
     """
 
     landed: Array
@@ -87,7 +87,7 @@ class Passage(eqx.Module):
 
 
 def choose(condition: Array, on_true: Any, on_false: Any) -> Any:
-    """Lane by lane one of two trees of arrays [lanes, ...]."""
+    """One of two trees of arrays [lanes, ...], lane by lane; condition: [lanes]."""
 
     def pick(a, b):
         return jnp.where(condition.reshape(-1, *[1] * (a.ndim - 1)), a, b)
@@ -96,12 +96,12 @@ def choose(condition: Array, on_true: Any, on_false: Any) -> Any:
 
 
 def are_finite(lanes: Lanes) -> Array:
-    """The lanes whose state and x2' are numbers, below `GROWN`."""
+    """Mask of the lanes whose state and x2' are numbers, below `GROWN` in size."""
     return (jnp.abs(lanes.x1) < GROWN) & (jnp.abs(lanes.x2) < GROWN) & (jnp.abs(lanes.a) < GROWN)
 
 
 def code_of(mode: Mode) -> Array:
-    """A mode as one number, whose digits to the base 5 are its contact codes."""
+    """A mode as one number, whose digits to the base 5 are its contact codes plus 2."""
     total = jnp.zeros(())
     for i, code in enumerate(mode.codes):
         total = total + (code + 2) * 5.0**i
@@ -109,7 +109,7 @@ def code_of(mode: Mode) -> Array:
 
 
 def codes_in(number: Array, belts: int) -> list[Array]:
-    """The contact codes, one for each belt, of which `code_of` made the number."""
+    """The contact codes, one a belt, of a number that `code_of` made."""
     codes = []
     for _ in range(belts):
         codes.append(number % 5 - 2)
@@ -118,10 +118,10 @@ def codes_in(number: Array, belts: int) -> list[Array]:
 
 
 def in_few(flags: Array, function: Callable[..., Any], args: Any, otherwise: Any) -> Any:
-    """What a function gives of the first `SERVED` lanes that have a flag, and of the others
-    `otherwise`; for what costs more than to pick lanes out. On accelerators of all with a flag.
+    """function(*args) in the first `SERVED` lanes that have a flag, and `otherwise` in the others.
 
-    args: trees of numbers and arrays [lanes].
+    Pays where the function costs more than picking lanes out. On accelerators, or with few lanes,
+    all flagged lanes are served. args: trees of numbers and arrays [lanes].
     """
     if not is_cpu() or flags.size <= 2 * SERVED:
         return choose(flags, where_any(flags, lambda: function(*args), otherwise), otherwise)
@@ -140,9 +140,9 @@ def in_few(flags: Array, function: Callable[..., Any], args: Any, otherwise: Any
 def materialise(value: Array, ones: Array) -> Array:
     """The value, computed once; ones: an array of ones, an argument of the kernel.
 
-    XLA on the CPU computes cheap values again in each place that uses them, and so what they depend
-    on. It holds a division to be expensive and keeps its result; dividing by ones that it cannot
-    see through changes no bit.
+    XLA on the CPU computes cheap values, and all that they depend on, again in each place that uses
+    them. It holds a division to be expensive and keeps its result; dividing by ones that it does
+    not know to be ones changes no bit.
     """
     if value.dtype == bool:
         return jnp.where(value, 1.0, 0.0) / ones > 0
@@ -151,10 +151,10 @@ def materialise(value: Array, ones: Array) -> Array:
 
 @dataclass(frozen=True)
 class Variable:
-    """What is known of a result.
+    """Description of a result.
 
-    per_belt: whether it has a number a belt. Of a category, an integer: meanings, what the values
-    stand for; or name_of(code, belts), if they are codes that are numbered when all runs are known.
+    per_belt: whether it has a number a belt. A category is an integer and has meanings, from values
+    to names; or name_of(code, belts), if its codes are numbered only when all runs are known.
     dimension: see `dimensions.quantity`; None where there is none, or only its author knows it.
     """
 
@@ -169,16 +169,16 @@ class Variable:
 class Observer(eqx.Module):
     """What a run hands in, and when it may end early: subclasses are static settings.
 
-    variables: what is known of the results, by name, in the order in which datasets show them.
-    steps_while_stuck: whether stick phases under a clock are stepped through, for what looks at
-    moments within them; else they are passed at once, as those without a clock always are.
+    variables: descriptions of the results, by name, in the order in which datasets show them.
+    steps_while_stuck: whether stick phases under a clock are stepped through, for observers that
+    look at times within them; else they are passed at once, as those without a clock always are.
     """
 
     variables: ClassVar[Mapping[str, Variable]] = {}
     steps_while_stuck: ClassVar[bool] = False
 
     def extrema(self, lanes: Lanes) -> Array | None:
-        """The lanes whose extrema of x2 are wanted, so that steps end at them; None: no lanes."""
+        """Mask of the lanes whose steps are to end at extrema of x2; None: no lanes."""
         return None
 
     @abc.abstractmethod
@@ -195,7 +195,7 @@ class Observer(eqx.Module):
     def follow(
         self, take_step: Callable, osc, window, ones: Array, lanes: Lanes, t1, rtol, atol
     ) -> Lanes:
-        """The lanes after `step.take_step`: for who looks at what is between the events."""
+        """The lanes after `step.take_step`; for observers that look between the events."""
         return take_step(osc, window, ones, lanes, t1, rtol, atol)
 
     @abc.abstractmethod
@@ -210,21 +210,21 @@ class Observer(eqx.Module):
         """
 
     def watch_rarely(self, osc: OwnOscillator, lanes: Lanes, ones: Array) -> Lanes:
-        """The lanes before each refill, every dozen steps or so: for what is costly to find out."""
+        """The lanes before each refill, every dozen steps or so; for costly checks."""
         return lanes
 
     @abc.abstractmethod
     def finish(self, osc: OwnOscillator, lanes: Lanes) -> dict[str, Any]:
         """The results of runs that ended, by the names in `variables`.
 
-        Arrays [lanes, ...], or tuples of arrays [lanes]; of the other lanes they are not used.
+        Arrays [lanes, ...], or tuples of arrays [lanes]; the entries of other lanes are not used.
         """
 
 
 class Program(eqx.Module):
     """Everything that is fixed when the kernel is compiled.
 
-    structure: of the oscillator's tree; mapped: which of its leaves differ from run to run; edges:
+    structure: that of the oscillator's tree; mapped: which leaves differ from run to run; edges:
     whether a contact edge may be met; captures: whether a run ends where a pseudo-focus captures
     it; derivatives: whether derivatives of the results are computed, too; own_t0: whether each run
     begins at a time of its own, a column of the queue behind x1 and x2. made_of: distinguishes

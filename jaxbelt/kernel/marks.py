@@ -14,8 +14,8 @@ from jaxtyping import Array
 from ..model.modes import select
 from .lanes import code_of, materialise
 
-#: Part of a loop, at least, that a run follows behind those that it need not, so that it ends on
-#: the way, and not at the end of a loop but for rounding.
+#: Least part of a loop that a run still follows behind the loops that it skips: so it ends within a
+#: loop, and not at the end of one up to rounding.
 LEAST_REST = 1e-6
 
 
@@ -23,8 +23,8 @@ class Mark(eqx.Module):
     """A state of a run that later ones are compared with, arrays [lanes].
 
     When it is 1, 2, 4, ... states old, the next one takes its place (Brent's method), so a cycle of
-    any number of such states is found at their first repetition or soon after. count: what is
-    counted along a run, its events, say, when it was there.
+    any number of such states is found at their first repetition or soon after. count: a count along
+    the run, of its events, say, at the mark; age: states since; limit: age at which it is replaced.
     """
 
     x1: Array
@@ -44,15 +44,15 @@ class Mark(eqx.Module):
     def met_by(self, run: Any, close: Array | float) -> Array:
         """Whether the runs are in the marked state again: mode, x2, and x1 to `close`.
 
-        run: has the state of the runs, x1, x2, and mode. x2 is that of a belt, or 0, on both
-        occasions, and so it is the same to the last bit.
+        run: has the state of the runs, x1, x2, and mode. x2 is the velocity of a belt, or 0, both
+        times, and so it is the same to the last bit.
         """
         same = (run.x2 == self.x2) & (code_of(run.mode) == self.code)
         return same & (jnp.abs(run.x1 - self.x1) <= close)
 
     def loops_left(self, run: Any, released: Array, t1: Array) -> Array:
-        """How many more times the runs pass the loop since their marks before t1, and some of it
-        once more; 0 where they are not `released` from a stick phase in the marked state."""
+        """How many loops, as since its mark, a run can skip before t1 with a part of one left; 0
+        where it is not `released` from a stick phase in the marked state."""
         period = run.t - self.t
         repeats = released & self.met_by(run, 0.0) & (period > 0)
         left = (t1 - run.t) / jnp.where(repeats, period, jnp.inf)
@@ -60,15 +60,15 @@ class Mark(eqx.Module):
         return lax.stop_gradient(jnp.where(repeats, loops, 0.0))
 
     def behind(self, run: Any, loops: Array) -> Array:
-        """The times of runs that pass the loop since their marks so many more times."""
+        """The times of the runs after `loops` more passes of the loop since their marks."""
         return jnp.where(loops > 0, run.t + loops * (run.t - self.t), run.t)
 
     def renewed(
         self, run: Any, at: Array, count: Array, ones: Array, met: Array | bool = False
     ) -> tuple["Mark", Array]:
-        """The marks when the runs `at` are in a state to compare, and which of them are new.
+        """The marks after the runs of the mask `at` came to a state to compare, and which are new.
 
-        met: runs that have come back to their mark, and are to go on from there.
+        met: mask of the runs that have come back to their mark; of those in `at` it is set anew.
         """
         age = self.age + jnp.where(at, 1, 0)
         old = age >= self.limit
@@ -88,9 +88,9 @@ class Mark(eqx.Module):
 class LoopSearch(eqx.Module):
     """A search for a loop that a run repeats, and what it has found, arrays [lanes].
 
-    number: how many arcs, or rounds, of the run there were so far. Of the loop: first, last: that
-    number where it began and where it first ended; t: the time where it first ended; period; loops:
-    how many more times the run passes it from there on, 0 where no loop was found.
+    number: how many arcs, or rounds, of the run there were so far; first, last: `number` where the
+    loop began and where it first ended; t: the time of that end; period: of the loop; loops: how
+    many more times the run passes it from there on, 0 where no loop was found.
     """
 
     mark: Mark
@@ -103,18 +103,18 @@ class LoopSearch(eqx.Module):
 
     @classmethod
     def none(cls, t: Array) -> "LoopSearch":
-        """Nothing was found yet; t: times of the runs."""
+        """Searches that have found nothing yet; t: times of the runs."""
         zero, count = jnp.zeros_like(t), jnp.zeros_like(t, jnp.int32)
         return cls(Mark.none(t), count, count, count, count, zero, zero)
 
     def advanced(
         self, run: Any, released: Array, t1: Array, ones: Array, room: int | None = None
     ) -> tuple["LoopSearch", Array]:
-        """The search where the runs stand now, and the times at which they go on: behind all loops
-        that they would only repeat.
+        """The search after the runs' present states, and the times at which the runs go on: behind
+        all loops that they would only repeat.
 
-        room: the largest number that a run may have by t1; one that would have more goes on as it
-        is.
+        room: the largest `number` at t1 of a run that skips loops; a run that would exceed it skips
+        none.
         """
         mark = self.mark
         loops = mark.loops_left(run, released, t1)
@@ -134,10 +134,10 @@ class LoopSearch(eqx.Module):
 
 
 def time_back(ts: Array, loops: Array, t: Array, period: Array) -> Array:
-    """How long before each of the times ts a run was in the same state when it first passed the
+    """How long before each of the times ts a run was in the same state on the first pass of the
     loop that it repeats.
 
-    loops, t, period: see `LoopSearch`. 0 before t, and behind the last of these loops.
+    loops, t, period: see `LoopSearch`. The answer is 0 before t and behind the last of these loops.
     """
     since, loops = ts - t, loops.astype(float)
     period = jnp.where(loops > 0, period, 1.0)

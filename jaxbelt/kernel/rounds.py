@@ -1,4 +1,4 @@
-"""Lanes at the start of their runs, and rounds of them that are written down."""
+"""Lanes at the start of their runs, and recorded rounds: events, then a few steps."""
 
 from dataclasses import replace
 
@@ -15,16 +15,16 @@ from .events import pass_events
 from .lanes import Lanes, code_of
 from .step import STEP_SAFETY, attempt, first_step, take_step, window_of
 
-#: Steps between two looks at the events: these cost about as much as a step, and a lane that waits
-#: for them is idle.
+#: Steps between two calls of `pass_events`: a call costs about as much as a step, and a lane that
+#: waits for it is idle.
 STEPS_PER_ROUND = 4
 
 
 def lanes_in(mode: Mode, a, finite, rests, status, run, x1, x2, passes, rtol) -> Lanes:
-    """Lanes that begin in a mode at the time 0, without what an observer adds.
+    """Lanes that begin in a mode at the time 0, without memory and integrals.
 
-    a: x2' there; finite, rests: whether the start is finite, and is a pseudo-focus; status: of
-    other starts.
+    a: x2' at the start; finite: whether the start is finite; rests: whether it is a pseudo-focus;
+    status: of starts that are finite and no pseudo-focus.
     """
     zero, count = jnp.zeros_like(x1), jnp.zeros_like(run)
     status = jnp.where(rests, Status.PSEUDO_FOCUS.value, status)
@@ -50,7 +50,7 @@ def lanes_in(mode: Mode, a, finite, rests, status, run, x1, x2, passes, rtol) ->
 
 
 def lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol) -> Lanes:
-    """Lanes at the start of their runs, without what an observer adds."""
+    """Lanes at the start of their runs, without memory and integrals."""
     mode = mode_of_state(osc, x1, x2)
     finite = jnp.isfinite(x1) & jnp.isfinite(x2) & has_possible_numbers(osc)
     rests = at_focus(osc, x1, x2) if has_edges(osc) else jnp.zeros_like(finite)
@@ -61,10 +61,10 @@ def lanes_at_start(osc: Oscillator, run, x1, x2, passes, rtol) -> Lanes:
 class Round(eqx.Module):
     """What happened to the lanes in a round, arrays [.., lanes].
 
-    t, x1, x2: where the lanes stood first, past what ended the step before: fired, whether that was
-    the guard of that number, captured, by a pseudo-focus; mode: the code of the mode from there on,
-    see `code_of`. stuck: they stuck then; released: that ended in time. rests: they are at rest.
-    ts, x1s, x2s: before the first step and after each, steps + 1 arrays; mode_after: theirs.
+    t, x1, x2, fired, number, captured, stuck, released, rests: of the events that it began with,
+    see `lanes.Passage`; mode: the code of the mode after the guard, before a stick phase, see
+    `code_of`. ts, x1s, x2s: before the first step and after each, steps + 1 arrays; mode_after: the
+    code of the mode of these steps.
     """
 
     t: Array
@@ -86,8 +86,8 @@ class Round(eqx.Module):
 def one_round(osc: Oscillator, lanes: Lanes, ones, t1, rtol, atol):
     """The lanes past the events and STEPS_PER_ROUND steps further, and the `Round`.
 
-    Their memory is a `marks.LoopSearch`, whose numbers are those of rounds: loops that a lane would
-    repeat it passes at once, behind the stick phase.
+    Their memory is a `marks.LoopSearch` that counts rounds: at the end of a stick phase a lane
+    skips all loops that it would repeat.
     """
     lanes, passage = pass_events(osc, lanes, t1, rtol, captures=True, derivatives=False)
     released = passage.released & ~lanes.mode.any_stuck

@@ -1,22 +1,22 @@
 """One step: an embedded Runge-Kutta step of all lanes that slip, and where it ends.
 
 A step is kept only if no guard vanishes in it. Within a step the velocity is known as a polynomial
-of degree four (its values and slopes at both ends, and its integral, the displacement). If that
-leaves the interval in which the mode holds, at the end or at an extremum on the way, the step is
-made again, shorter, so that it ends on the first root; what is then left of the way, less than
-`LANDING * sqrt(tolerance)`, is bridged by one Taylor step. So the states at events are as good as
-the integration, not as its interpolant, and excursions within one step are found. Where a contact
-edge lies ahead (or extrema are wanted), steps also end where x2 = 0: no extremum of x1 within one
-is beyond the edge.
+of degree four (its values and slopes at both ends, and its integral, the displacement). If this
+polynomial leaves the interval in which the mode holds, at the end or at an extremum on the way, the
+step is made again, shorter, so that it ends near the first root; the time that is left to the root,
+less than `LANDING * sqrt(tolerance)`, is bridged by one Taylor step. So the states at events are as
+good as the integration, not as its interpolant, and excursions within one step are found. Where a
+contact edge lies ahead (or the observer asks for extrema), steps also end where x2 = 0: then no
+extremum of x1 within a step is beyond the edge.
 
 The Runge-Kutta stages are written for x1' = x2 (Nystroem's form: the accelerations alone are kept),
 and each acceleration is one quotient, with the division last. That is for XLA on the CPU, which
 computes everything that it deems cheap again in each place where it is used; a division it keeps.
 
-Derivatives are forward mode (see `derivatives.in_directions`): step sizes carry none, the landing's
-Taylor step gives event times and states their exact ones, and so does the last step, t1 - t. Near
-rest any step will do for the state, but not for its derivatives. So where these are wanted, a step
-also has to keep the tolerance for a motion of size one in the linearised field.
+Derivatives are forward mode (see `derivatives.in_directions`): step sizes carry none; the Taylor
+step to the guard, and the last step, t1 - t, give times and states their exact derivatives. Near
+rest any step will do for the state, but not for its derivatives. So where these are computed, a
+step also has to keep the tolerance for a motion of size one in the linearised field.
 """
 
 import functools
@@ -62,21 +62,21 @@ LEAST_ERROR, LARGEST_ERROR = 1e-5, 1e5
 #: Longest time that a Taylor step to a guard bridges, over the square root of the tolerance: where
 #: x2'' is of order one, the terms that it leaves out are far below the tolerance then.
 LANDING = 0.1
-#: Largest of these terms, x2'' delta^2, over the tolerance: heavy belts change x2' faster.
+#: Largest of the terms left out, x2'' delta^2, over the tolerance: heavy belts change x2' faster.
 LANDS_WITHIN = 0.1
 #: Speed over |x2'| below which an edge is passed slowly: over a way d, the terms that the Taylor
 #: step leaves out grow like (|x2'| d / x2^2)^2.
 SLOW = 0.1
-#: A lane whose next step would be shorter stands on a bound of its mode.
+#: A lane whose next step would be shorter than this stands on a bound of its mode.
 NO_STEP = 1e-15
-#: A time that no Taylor step bridges, and finite, so that derivatives are.
+#: A time that no Taylor step bridges; it is finite so that derivatives are finite, too.
 NEVER = 1e300
 
 
 class _Tableau(NamedTuple):
     """Weights of the stages' accelerations for x'' = a: in x2 (`a`) and in x1 (`aa`), a row a
-    stage, the last one the solution; the stages' times `c`; the same weights of the error estimate
-    (`e`, `ea`).
+    stage, the last one the solution; the stages' times `c`; the weights of the error estimates of
+    x2 and x1 (`e`, `ea`).
 
     linear: a bound of the error of a step of y' = k y, over (h k)^8 y, for h k up to 0.9: a quarter
     of its estimate, which is sixteen times the error at 0.7 and nine times at 0.9.
@@ -92,7 +92,7 @@ class _Tableau(NamedTuple):
 
 @functools.cache
 def nystroem() -> _Tableau:
-    """The weights of the steps."""
+    """The weights of the steps: Dormand's and Prince's method of order eight."""
     # Order eight takes twice the stages of order five and a third of the steps at 1e-8, and most of
     # a step's cost is not in its stages but in its interpolant, bounds and choices.
     tableau = the_solvers().Dopri8.tableau
@@ -108,8 +108,8 @@ class _Window(eqx.Module):
     """Bounds of the modes, arrays [lanes].
 
     x1, x2: (lower, upper); x1 is None where there are no edges. stops_at: lanes whose steps end at
-    (minima, maxima) of x1; None: no lanes. extrema: lanes whose extrema are wanted. signs, pulls:
-    constants of the mode's field, one a belt. active: lanes that slip.
+    (minima, maxima) of x1; None: no lanes. extrema: lanes whose extrema the observer asks for.
+    signs, pulls: constants of the mode's field, one a belt. active: lanes that slip.
     """
 
     x1: tuple[Array, Array] | None
@@ -152,14 +152,14 @@ def window_of(osc: Oscillator, lanes: Lanes, *, extrema: Array | None) -> _Windo
 
 
 def _bounds_of_x2(window: _Window, ones: Array, lanes: Lanes) -> tuple[Array, Array]:
-    """The bounds of x2 for the next step; 0 is one where that is to end at an extremum of x1."""
+    """The bounds of x2 for the next step; 0 where the step is to end at an extremum of x1."""
     low, high = window.x2
     if window.stops_at is None:
         return low, high
     at_minimum, at_maximum = window.stops_at
     rises = (lanes.x2 > 0) | ((lanes.x2 == 0) & (lanes.a > 0))
     falls = (lanes.x2 < 0) | ((lanes.x2 == 0) & (lanes.a < 0))
-    # Of the boundary of a belt at rest the derivatives stay.
+    # The boundary of a belt at rest, already 0, is kept with its derivatives.
     low = jnp.where(at_maximum & rises & (low < 0), 0.0, low)
     high = jnp.where(at_minimum & falls & (high > 0), 0.0, high)
     return materialise(low, ones), materialise(high, ones)
@@ -210,7 +210,7 @@ def _(primals, tangents):
 
 
 def _sum_of_changes(*pairs: tuple[Any, Any]) -> Any:
-    """The sum of changes by their weights, of those that are not known to be zero."""
+    """The sum of weight * change over the pairs whose change is not a symbolic zero."""
     known = [weight * change for weight, change in pairs if not isinstance(change, SymbolicZero)]
     return functools.reduce(jnp.add, known) if known else 0.0
 
@@ -218,7 +218,7 @@ def _sum_of_changes(*pairs: tuple[Any, Any]) -> Any:
 def _value_and_change(
     tree: Any, change: Any, function: Callable[[Any], Any]
 ) -> tuple[Any, Any] | None:
-    """A function of a tree and how it changes with it; None where nothing of the tree changes."""
+    """function(tree) and its derivative along `change`; None if all changes are symbolic zeros."""
     leaves, structure = jax.tree.flatten(tree)
     changes = jax.tree.leaves(change)
     if all(isinstance(one, SymbolicZero) for one in changes):
@@ -303,7 +303,7 @@ def _interpolate(ones: Array, lanes: Lanes, new: _Attempt) -> _Interpolant:
     k4 = 30 * (new.x1 - lanes.x1 - h * mean) / jnp.where(h > 0, h, 1.0)
     c2, c3 = 3 * rise - 2 * m0 - m1, m0 + m1 - 2 * rise
     k = (m0, c2 + k4, c3 - 2 * k4, k4)
-    # Where the cubic is extreme: of an error there only the square counts.
+    # Place of the cubic's extremum: its error enters the value of x2 there only as a square.
     has_extremum = lanes.a * new.a < 0
     divisor = jnp.sign(m0) * jnp.sqrt(jnp.maximum(c2 * c2 - 3 * c3 * m0, 0.0)) - c2
     safe = has_extremum & (divisor != 0)
@@ -314,11 +314,11 @@ def _interpolate(ones: Array, lanes: Lanes, new: _Attempt) -> _Interpolant:
 
 
 class _Landing(eqx.Module):
-    """What a step has to do with the bounds of its mode.
+    """How a step meets the bounds of its mode.
 
-    reached: it ends so near to one that the time `delta` is left to (x1, x2) on it; blocked: it
-    ends beyond one, or has its extremum there; theta: the fraction of it that ends on the bound.
-    on_edge: the bound is a contact edge.
+    reached: it ends so near to a bound that a Taylor step over the time `delta` lands on it; x1,
+    x2: the edge and the boundary ahead; on_edge: the bound is the edge. blocked: the step ends
+    beyond a bound, or has its extremum there; theta: the fraction of it that ends on the bound.
     """
 
     reached: Array
@@ -350,7 +350,7 @@ def _landing(
     delta = jnp.where(reached, bound - new.x2, NEVER) / slope
     # The next term counts where x2' is small, and there x2'' is -x2.
     delta = jnp.where(reached, delta + 0.5 * bound * delta**2 / slope, delta)
-    # A quarter where the bound is x2 = 0: what is left there is the rounding of x2' in a step.
+    # The 0.25 is for the bound x2 = 0: the rounding of x2' in a step is left there.
     rounding = ULPS * (0.25 + jnp.abs(peak))
     outside = (peak > high + rounding) | (peak < low - rounding)
     blocked = outside & ~reached
@@ -464,7 +464,7 @@ def take_step(
     """One step of the lanes that slip: kept, shortened to end on a bound, or rejected.
 
     rates(osc, mode, t, x1, x2), a tree of arrays [lanes], is integrated with the motion.
-    derivatives: whether those of the result are to be as good as the tolerance, too.
+    derivatives: whether the derivatives of the result have to keep the tolerance, too.
     """
     remaining = t1 - lanes.t
     going = window.active & (lanes.h > 0) & (remaining > 0)
@@ -474,14 +474,14 @@ def take_step(
     at = _landing(window, ones, lanes, new, path, rtol, atol)
     blocked, reached = at.blocked, at.reached
     if derivatives:
-        # At rest no bound has a say in how the neighbours of a lane move.
+        # The bounds of a lane at rest are ignored: they do not affect how its neighbours move.
         rests = is_at_rest(lanes.x1, lanes.x2, lanes.a)
         blocked, reached = blocked & ~rests, reached & ~rests
 
     last = h >= remaining
     accepted = going & (new.error <= 1)
     lands = accepted & ~blocked & reached & ~(last & (at.delta > 0))
-    # One number, because many results depend on it.
+    # One number, materialised once, because many results depend on it.
     outcome = jnp.where(accepted, jnp.where(blocked, -1.0, 1.0), 0.0)
     outcome = materialise(jnp.where(lands, 2.0, outcome), ones)
     shortened, kept, lands = outcome < 0, outcome > 0, outcome > 1
@@ -523,10 +523,10 @@ def _bridged(lands, on_edge, delta, bound, new: _Attempt) -> tuple[Array, Array]
 
 @jax.custom_jvp
 def _with_its_derivatives(lands, on_edge, delta, bound, new: _Attempt, end):
-    """The time of the Taylor step and the state at its end, (x1, x2, x2'), which is given.
+    """The time delta of the Taylor step and (x1, x2) at its end, (x1, x2, x2'), as they are given.
 
-    The derivatives are those of the exact passage, to the second order in the time. Those of the
-    series that gives the time itself would lack the first.
+    Their derivatives are those of the exact passage, to the second order in delta. Derivatives of
+    the series that gives delta would lack the first order.
     """
     return delta, *end[:2]
 
@@ -555,7 +555,7 @@ def integrated(rates, osc, lanes: Lanes, new: Any, delta, x1, x2, kept) -> Any:
 
 
 def next_size(lanes: Lanes, new: Any, going, accepted) -> tuple[Array, Array]:
-    """The lanes' pace after a step, and the size of the next one by its error."""
+    """The lanes' pace after a step, and the size of the next step by the error of this one."""
     # NaN is a large error, too; the error is of order eight in h.
     error = jnp.where(new.error < LARGEST_ERROR, jnp.maximum(new.error, LEAST_ERROR), LARGEST_ERROR)
     # The eighth root as roots of roots: XLA's power and its quotient by a root are no vector
@@ -569,8 +569,8 @@ def next_size(lanes: Lanes, new: Any, going, accepted) -> tuple[Array, Array]:
 
 
 def shortened_or_landed(proposed, shortened, shorter, lands) -> tuple[Array, Array]:
-    """The size of the next step where one was shortened; negative of lanes that have landed, or
-    stand on a bound at once; and which these last ones are."""
+    """The size of the next step, `shorter` where one was shortened, negative in lanes that landed
+    or stand on a bound at once; and the mask of those that stand on one at once."""
     stands = shortened & (shorter < NO_STEP)
     proposed = jnp.where(shortened, shorter, proposed)
     proposed = jnp.where(stands, NO_STEP, proposed)

@@ -1,6 +1,6 @@
-"""Lanes whose oscillators know the time: how they go on from a guard, beside `events`.
+"""Events of lanes of oscillators with a clock; `events` has those of lanes without.
 
-What follows at a guard is decided by `instants`, a lane at a time.
+What follows at a guard is decided by `model.instants`, lane by lane.
 """
 
 from dataclasses import replace
@@ -43,10 +43,10 @@ def pass_timed_events(
     derivatives: bool,
     jumps: bool,
 ) -> tuple[Lanes, Passage]:
-    """Lanes that stand on a guard go on, see `events.pass_events`.
+    """The lanes past the guards that they stand on, as from `events.pass_events`.
 
     jumps: whether a stick phase whose end is known is passed at once; else it is stepped through,
-    for observers that look at what is between the events.
+    for observers that look at times between the events.
     """
     landed = (lanes.h < 0) & ~lanes.done
     no, zero = jnp.zeros_like(landed), jnp.zeros_like(lanes.t)
@@ -71,7 +71,7 @@ def pass_timed_events(
     def go_on(osc, lanes, t1):
         return _through_guards(osc, lanes, t1, rtol, captures, jumps)
 
-    # Lanes that are not among the few wait until the next time.
+    # Lanes that `in_few` does not serve wait for the next call.
     after, passage = in_few(landed, go_on, (osc, bare, t1), (bare, still))
     own = dict(memory=lanes.memory, integrals=lanes.integrals)
     return replace(after, done=after.done | (after.t >= t1), **own), passage
@@ -107,7 +107,7 @@ def _through_guards(
     stays = fired & ~changed & ~mode.any_stuck
     shortest = SHORTEST_TIMED_STEP * LANDING * jnp.sqrt(rtol)
     begun = jnp.where(stays, shortest, first_step(rtol))
-    # A stick phase is known beforehand.
+    # The motion of a mass that sticks is known: its first step need not be short.
     h = jnp.where(fired, jnp.where(mode.any_stuck, LONGEST_STEP, begun), abs(lanes.h))
     after = replace(
         lanes,
@@ -148,8 +148,8 @@ def _through_guards(
 
 
 def _planned(osc: Oscillator, lanes: Lanes, t1: Array) -> Lanes:
-    """The lanes with the ends of the stick phases that begin, or go on where the search for their
-    ends stopped."""
+    """The lanes with the ends, `until` and `hit`, of the stick phases that begin or whose end was
+    not found by the search before."""
     begins = lanes.mode.any_stuck & ~lanes.done
     asked = begins & (lanes.status != Status.STUCK_FOREVER.value)
     remaining = t1 - lanes.t
@@ -161,14 +161,14 @@ def _planned(osc: Oscillator, lanes: Lanes, t1: Array) -> Lanes:
         lanes,
         until=jnp.where(begins, jnp.where(goes_on, jnp.inf, lanes.t + duration), lanes.until),
         hit=jnp.where(begins, number, lanes.hit).astype(lanes.hit.dtype),
-        # No step leads to where a lane is.
+        # A phase that ends at once: the lane has landed without a step.
         h=jnp.where(begins & ~goes_on & (duration <= 0), -LONGEST_STEP, lanes.h),
     )
 
 
 def _jumped(osc: Oscillator, lanes: Lanes, stuck: Array, t1, rtol) -> tuple[Lanes, Array]:
-    """The lanes that are stuck at the ends of their phases, and those that begin to slip there;
-    those that come to an edge, or whose end is not known yet, have landed."""
+    """The stuck lanes moved to the ends of their phases, and the mask of those that begin to slip
+    there; lanes that come to an edge, or whose end is not known yet, have landed."""
     n = len(osc.belts)
     released = stuck & (lanes.until <= t1) & (lanes.hit >= 3 * n)
     t = jnp.where(stuck, jnp.minimum(lanes.until, t1), lanes.t)

@@ -1,13 +1,13 @@
-"""What knows the time, within a step: waves at the times of the stages, without a cosine for each.
+"""Forces, velocities and loads at the times of a step's stages, without a cosine for each.
 
 Over a step of size h a wave A cos(Omega t + phi) turns by the angle x = Omega h. Its cosine and
-sine in the middle of the step are computed once; at the part c of the step it is
+sine in the middle of the step are computed once; at the fraction c of the step the wave is
 
     A (cos(middle) cos((c - 1/2) x) - sin(middle) sin((c - 1/2) x)),
 
-and there the cosine and the sine, of a small angle, are polynomials whose coefficients are numbers.
-So are the integrals of waves, for small frequencies, too. Forces of one's own are asked at each
-time.
+where the cosine and the sine of the small angle (c - 1/2) x are polynomials with fixed
+coefficients. So are the integrals of waves, for small frequencies, too. Forces of the user's own
+classes are evaluated at each time.
 """
 
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ _QUARTER = (1.5707963267341256, 6.077100506303966e-11, 2.0222662487959506e-21)
 
 @jax.custom_jvp
 def cosine_and_sine(angle: Array) -> tuple[Array, Array]:
-    """Both, for angles up to some 1e6: a fraction of the cost of XLA's."""
+    """Cosine and sine of angles up to some 1e6, at a fraction of the cost of XLA's."""
     quarters = jnp.round(angle * (2 / np.pi))
     x = angle
     for part in _QUARTER:
@@ -62,7 +62,7 @@ def _(primals, tangents):
 
 
 def _even(y: Array, coefficients: Sequence[float]) -> Array:
-    """A polynomial in y."""
+    """A polynomial in y, the lowest order first."""
     total: Any = coefficients[-1]
     for c in reversed(coefficients[:-1]):
         total = total * y + c
@@ -70,7 +70,7 @@ def _even(y: Array, coefficients: Sequence[float]) -> Array:
 
 
 def turn_of(osc: Oscillator, force: AbstractForce) -> Array | None:
-    """Of a `BaseMotion`, on the mass a wave cos u - turn sin u; None of a cosine."""
+    """The `turn` of a `BaseMotion`, a wave cos u - turn sin u on the mass; None for a cosine."""
     return osc.damping * force.frequency if isinstance(force, BaseMotion) else None
 
 
@@ -87,8 +87,8 @@ def along_and_across(angle: Array, turn: Array | None) -> tuple[Array, Array]:
 
 
 class StepWave(NamedTuple):
-    """mean + along cos(u) - across sin(u), u = (c - 1/2) x, at the part c of a step; x: the angle
-    of the step, frequency: the angle of a unit of time."""
+    """mean + along cos(u) - across sin(u), u = (c - 1/2) x, at the fraction c of a step; x: the
+    angle of the step, frequency: the angle per unit of time."""
 
     mean: Array | float
     along: Array
@@ -97,19 +97,19 @@ class StepWave(NamedTuple):
     frequency: Array
 
     def at(self, c: float) -> Array:
-        """What it is at the part c of the step."""
+        """Its value at the fraction c of the step."""
         u, y = c - 0.5, self.x * self.x
         cosine = _even(y, [(-1) ** k * u ** (2 * k) / factorial(2 * k) for k in range(TERMS + 1)])
         odd = [(-1) ** k * u ** (2 * k + 1) / factorial(2 * k + 1) for k in range(TERMS)]
         return self.mean + self.along * cosine - self.across * (self.x * _even(y, odd))
 
     def rate(self, c: float) -> Array:
-        """Its derivative by the time there."""
+        """Its time derivative at the fraction c of the step."""
         turned = StepWave(0.0, -self.across, self.along, self.x, self.frequency)
         return self.frequency * turned.at(c)
 
     def integral(self, c: float, h: Array) -> Array:
-        """Its integral over the part c of the step, of size h."""
+        """Its integral over the first fraction c of the step of size h."""
         u, y = (-0.5, c - 0.5), self.x * self.x
 
         def power(n: int) -> float:
@@ -134,7 +134,10 @@ class _Constant(NamedTuple):
 
 
 class StepClock(NamedTuple):
-    """All that an oscillator knows of the time in a step from t on, of size h."""
+    """All of an oscillator that depends on the time, in a step of size h from t on.
+
+    forces: waves and constants, on the mass; others: forces of the user's own classes.
+    """
 
     osc: Oscillator
     t: Array
@@ -147,7 +150,7 @@ class StepClock(NamedTuple):
 
     @classmethod
     def of(cls, osc: Oscillator, ones: Array, t: Array, h: Array) -> "StepClock":
-        """That of the lanes' next steps."""
+        """The clock of the lanes' next steps."""
         middle = t + 0.5 * h
 
         def wave(mean, amplitude, frequency, phase, turn=None):
@@ -176,7 +179,7 @@ class StepClock(NamedTuple):
         return cls(osc, t, h, ones, forces, others, velocities, loads)
 
     def at(self, c: float) -> Oscillator:
-        """The oscillator without a clock that it is at the part c of the step."""
+        """The oscillator as it is at the fraction c of the step, without a clock."""
         pushes = [force.at(c) for force in self.forces]
         time = self.t + c * self.h
         for force in self.others:
@@ -188,14 +191,14 @@ class StepClock(NamedTuple):
         return unchecked(Oscillator, damping=damping, belts=belts, omega=omega, forcing=forcing)
 
     def carried(self, mode: Mode, x1: Array, c: float) -> tuple[Array, Array]:
-        """The state (x1, x2) at the part c of the step of a mass that sticks."""
+        """The state (x1, x2) of a mass that sticks, at the fraction c of the step."""
         ways = [v.integral(c, self.h) for v in self.velocities]
         speeds = [v.at(c) for v in self.velocities]
         if len(ways) == 1:
             return x1 + ways[0] / self.osc.omega, speeds[0] / self.osc.omega
         rows = [jnp.broadcast_to(x, x1.shape) for x in (*ways, *speeds)]
         n, zero = len(ways), jnp.zeros_like(x1)
-        # In the middle of the step: what does not depend on the time.
+        # In the middle of the step, so that the choice of the belt does not depend on c.
         osc = self.at(0.5)
         way, speed = (foremost(osc, mode.stuck, x, zero) for x in (rows[:n], rows[n:]))
         return x1 + way / self.osc.omega, speed / self.osc.omega

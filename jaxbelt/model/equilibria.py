@@ -3,15 +3,15 @@
 The contact edges cut the x1 axis into zones. At rest within a zone every touching belt that moves
 pulls with u0_i mu_i(|nu_i|) sgn(nu_i), and the spring balances their sum, the pull, at x1 = pull.
 That is a fixed point, eq. (24) of the paper, if it lies in the zone. Touching belts at rest hold
-whatever is up to their capacity, the sum of u0_k mus_k: then all x1 within the capacity of the
-pull are pseudo-equilibria, a segment. At an edge between two zones whose accelerations both point
-to the edge, a_L > 0 > a_R, there is a pseudo-focus (see `pseudofocus.edge_focus`).
+any force up to their capacity, the sum of u0_k mus_k: then all x1 no farther than the capacity
+from the pull are pseudo-equilibria, a segment. At an edge between two zones whose accelerations
+both point to the edge, a_L > 0 > a_R, there is a pseudo-focus (see `pseudofocus.edge_focus`).
 
-At an edge that pushes away to both sides, a_L < 0 < a_R, there is a saddle: x1' = x2 on both sides,
-so nothing slides along an edge, and (sigma, 0) is a visible-visible two-fold (see M. Guardia, T. M.
-Seara and M. A. Teixeira, Generic bifurcations of low codimension of planar Filippov systems, J.
-Differential Equations 250 (2011) 1967-2023). Four orbits reach and leave it in a finite time. No
-mass rests there: what asks where it can rest takes `candidates`, which leaves saddles out.
+At an edge from which both sides push the mass away, a_L < 0 < a_R, there is a saddle: x1' = x2 on
+both sides, so nothing slides along an edge, and (sigma, 0) is a visible-visible two-fold (see M.
+Guardia, T. M. Seara and M. A. Teixeira, Generic bifurcations of low codimension of planar Filippov
+systems, J. Differential Equations 250 (2011) 1967-2023). Four orbits reach and leave it in a finite
+time. No mass rests there: code that asks where it can rest calls `candidates`, without saddles.
 
 Everything is in closed form, so derivatives with respect to any parameter go through.
 """
@@ -82,17 +82,17 @@ class Equilibria(eqx.Module):
         x1_upper: Upper end of a segment, else x1.
         modes: Contact codes, [equilibria, belts] (+1/-1 slip with that sign of r_i, 0 stuck, -2/+2
             mass below/above the belt's interval; all 0 where padded). At a pseudo-focus and a
-            saddle those of the left-hand side of the edge.
+            saddle, the codes on the left-hand side of the edge.
         jacobian: Jacobian of the field of the mode at a fixed point, [equilibria, 2, 2], else NaN.
-        eigenvalues: Its eigenvalues, eqs. (25) and (26) of the paper, the one with the larger real
-            or imaginary part first, complex [equilibria, 2], else NaN.
+        eigenvalues: Eigenvalues of the Jacobian, eqs. (25) and (26) of the paper, the one with the
+            larger real or imaginary part first, complex [equilibria, 2], else NaN.
         rate: Small disturbances behave like exp(rate t). The largest real part of the eigenvalues
             at a fixed point; at a pseudo-focus `(tr_L/a_L + tr_R/|a_R|) / (3 (1/a_L + 1/|a_R|))`,
-            or -inf where a belt at rest touches, which ends them in a finite time; inf at a saddle,
-            which is left in a finite time; NaN for a segment.
+            or -inf where a belt at rest touches, as disturbances then end in a finite time; inf at
+            a saddle, which is left in a finite time; NaN for a segment.
         stable: Whether rate < 0; for segments see above.
         neutral: Whether it is a centre: orbits around it are closed, so it neither attracts nor
-            repels. That is where the forces on each side are the same at x2 and -x2, as without
+            repels. This holds where the forces on each side are the same at x2 and -x2, as without
             damping and with friction that does not depend on the speed.
     """
 
@@ -202,15 +202,15 @@ def equilibria(osc: Oscillator) -> Equilibria:
 
 
 def _existing(rows, found: Equilibria):
-    """Cuts the padding off where it is known, that is, outside of transformations."""
+    """The rows without padding where values are concrete, that is, outside of transformations."""
     if not is_concrete((rows, found)):
         return rows
     return pick(rows, slice(int(np.sum(np.asarray(found.kind) > 0))))
 
 
 def most_equilibria(osc: Oscillator) -> int:
-    """Largest possible number of equilibria: one for each zone and each edge, as far as edges
-    are known."""
+    """Largest possible number of equilibria: one for each zone and each edge (known edges count if
+    they are finite, and once if they are equal)."""
     places = edges(osc)
     if is_concrete(places):
         places = [place for place in set(map(float, places)) if np.isfinite(place)]
@@ -228,7 +228,7 @@ def candidates(osc: Oscillator) -> Equilibria:
 
 @jit
 def _all_candidates(osc: Oscillator) -> Equilibria:
-    """States of rest and saddles, as `candidates`."""
+    """States of rest and saddles, in rows like those of `candidates`."""
     return _rows_of(osc, with_saddles=True)
 
 
@@ -259,12 +259,12 @@ def _in_zones(osc: Oscillator) -> Equilibria:
     rounding = edge_rounding(pull, 1.0 + held)
     is_fixed = possible & (held == 0) & (lower - rounding < pull) & (pull < upper + rounding)
     on_lower, on_upper = (jnp.abs(pull - edge) < rounding for edge in (lower, upper))
-    # On an edge beyond which belts at rest hold the mass it is the end of that segment; an
-    # equilibrium of both sides is listed with the left one.
+    # A fixed point on an edge, beyond which belts at rest hold the mass, is an end of their
+    # segment; one that both sides share is listed with the left zone.
     is_fixed &= ~(on_lower & (up_from_below == 0)) & ~(on_upper & held_above)
     first, last = jnp.maximum(pull - held, lower), jnp.minimum(pull + held, upper)
     at_first, at_last = first - lower < rounding, upper - last < rounding
-    # A segment of one point, an edge, is one if the other side pushes back to it.
+    # A segment of a single point, at an edge, counts if the other side pushes the mass back to it.
     is_point = at_last & (down_from_above > 0) | at_first & (up_from_below > 0)
     least = jnp.where(is_point, -rounding, rounding)
     is_segment = possible & (held > 0) & (last - first > least)
@@ -277,11 +277,11 @@ def _in_zones(osc: Oscillator) -> Equilibria:
 
     kinetic = kinetic_capacity(osc, mode)
     attracts = jnp.maximum(pull - kinetic, lower) < jnp.minimum(pull + kinetic, upper)
-    # Or a mass that slips away passes an edge, is pushed back to it, and stops where it came from.
+    # A segment attracts, too, if a mass that slips off over an edge is pushed back and stops there.
     attracts |= at_first & (up_from_below > 0)
     attracts |= at_last & (down_from_above > 0)
 
-    # Nothing stays where the other side of the edge pushes away.
+    # A fixed point on an edge is not stable where the other side pushes the mass away.
     stays = ~(on_lower & (up_from_below < 0)) & ~(on_upper & (down_from_above < 0))
     neutral = is_fixed & is_centre(osc, mode) & stays
     on_edge = lax.stop_gradient(jnp.clip(pull, lower, upper) - pull)
@@ -308,10 +308,10 @@ def _outside_of(osc: Oscillator, edge: Array, *, rightward: bool) -> tuple[Array
 
 
 def edge_rounding(x1: Array, scale: Array | float = 1.0) -> Array:
-    """Distance from a contact edge up to which a fixed point lies on it.
+    """Distance from a contact edge below which a fixed point counts as on the edge.
 
-    x1 and forces of size `scale` are good to some 1e-16 of themselves, and nothing is integrated,
-    see `force_rounding`.
+    Positions x1 and forces of size `scale` are accurate to about 1e-16 of themselves; no integrated
+    arc adds to that, unlike in `force_rounding`.
     """
     return 1e-14 * (scale + jnp.abs(x1))
 
@@ -319,7 +319,7 @@ def edge_rounding(x1: Array, scale: Array | float = 1.0) -> Array:
 def at_rest_beside(osc: Oscillator, x1: Array, *, rightward: bool) -> tuple[Mode, Array]:
     """The mode of a mass at rest just beside each x1, [places], on one side, and x2' there.
 
-    x2' is 0 for a fixed point, up to rounding; its derivatives stay.
+    Where x2' is only rounding, as at a fixed point, it is exactly 0; its derivatives are kept.
     """
     rest = jnp.zeros_like(x1)
     mode = settle(osc, contact_beside(osc, x1, rest, rightward=rightward), x1, rest)
@@ -342,13 +342,13 @@ def side_pulls(osc: Oscillator, x1: Array) -> tuple[Array, Array]:
 
 @jit
 def saddles(osc: Oscillator) -> Array:
-    """Whether both sides push away from the point (sigma, 0) of each edge, [edges]."""
+    """Boolean mask [edges] of edges whose point (sigma, 0) is a saddle: both sides push away."""
     left, right = pushes_away(osc)
     return (left > 0) & (right > 0)
 
 
 def pushes_away(osc: Oscillator) -> tuple[Array, Array]:
-    """How hard both sides push away from the point (sigma, 0) of each edge, [edges] each."""
+    """Accelerations away from each edge just left and right of (sigma, 0), [edges] each, or NaN."""
     positions = jnp.stack(edges(osc))
     left, right = side_pulls(osc, jnp.where(jnp.isfinite(positions), positions, 0.0))
     none = jnp.full_like(positions, jnp.nan)
@@ -386,7 +386,7 @@ def _eigenvalues(matrix: Array) -> Array:
 
 def _at_edges(osc: Oscillator, positions: Array, *, with_saddles: bool) -> Equilibria:
     before = jnp.concatenate([jnp.full(1, -jnp.inf), positions[:-1]])
-    # Edges at one place count once, up to rounding; finite numbers stand for infinite ones.
+    # Edges that are equal up to rounding count once; those at infinity are replaced by 0.
     is_edge = jnp.isfinite(positions) & (positions - before > force_rounding(positions))
     x1 = jnp.where(is_edge, positions, 0.0)
     rest = jnp.zeros_like(x1)
@@ -394,7 +394,7 @@ def _at_edges(osc: Oscillator, positions: Array, *, with_saddles: bool) -> Equil
         at_rest_beside(osc, x1, rightward=side) for side in (False, True)
     )
     focus = edge_focus(osc, left, right, x1)
-    # Where a belt at rest holds the mass, the segment on that side ends here.
+    # Where a belt at rest holds the mass on one side, the edge only ends that side's segment.
     slips = is_edge & ~left.any_stuck & ~right.any_stuck
     is_focus = slips & (a_left > 0) & (a_right < 0)
     is_saddle = slips & (a_left < 0) & (a_right > 0) & with_saddles
@@ -422,7 +422,7 @@ def _at_edges(osc: Oscillator, positions: Array, *, with_saddles: bool) -> Equil
 
 
 def repelling_foci(osc: Oscillator) -> Array:
-    """x1 of the pseudo-foci that repel, a row for each edge, NaN where there is none."""
+    """x1 of the pseudo-foci that repel, [edges], NaN for edges without one."""
     found = _at_edges(osc, jnp.sort(jnp.stack(edges(osc))), with_saddles=False)
     return jnp.where((found.rate > 0) & ~found.neutral, found.x1, jnp.nan)
 
@@ -440,17 +440,17 @@ def lyapunov_coefficient(osc: Oscillator) -> Array:
     of Yu. A. Kuznetsov, Elements of Applied Bifurcation Theory, with eigenvectors of unit length,
     is 2 a.
 
-    Their formula needs the linear part to be a rotation. It is one with unit frequency: the
+    Their formula needs the linear part to be a rotation. Here it is one with unit frequency: the
     derivatives of x2' by x1 and x2 are -1 and the trace. And x1' = x2 and the spring are linear, so
-    of its ten derivatives only two do not vanish, d^2 x2'/dx2^2, which enters in products with
-    vanishing ones only, and d^3 x2'/dx2^3: a = (d^3 x2'/dx2^3) / 16.
+    of the formula's ten derivatives only two do not vanish: d^2 x2'/dx2^2, which enters in products
+    with vanishing ones only, and d^3 x2'/dx2^3. Hence a = (d^3 x2'/dx2^3) / 16.
 
     Args:
         osc: The oscillator at a Hopf point, where the trace of the Jacobian is 0. Elsewhere the
             number still describes the Hopf point nearby.
 
     Returns:
-        One number for each row of `equilibria(osc)`, [equilibria], NaN where that is no fixed
+        One number for each row of `equilibria(osc)`, [equilibria], NaN for rows that are no fixed
         point.
 
     Raises:

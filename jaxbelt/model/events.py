@@ -1,8 +1,8 @@
 """Events, the changes of mode, and signatures, the events of one loop.
 
 `simulate`, the orbits behind cycles and sweeps all name their events by `event_between`. The
-signature of a cycle begins where the cycle begins; where two are compared, or one is named, they
-are brought to the same order first, by `of_one_loop`.
+signature of a cycle begins where the cycle begins; before signatures are compared or named,
+`of_one_loop` brings them into one order.
 """
 
 from collections.abc import Sequence
@@ -22,10 +22,10 @@ Signature = tuple[tuple[EventKind, int], ...]
 def event_between(before: Sequence[Any], after: Sequence[Any]) -> tuple[Any, Any]:
     """The event, (kind, belt), that leads from one mode to another; (0, -1) where they are equal.
 
-    before, after: contact codes, an array a belt, of JAX or of NumPy, any common shape. Where a
-    belt comes or goes it is an EDGE, whatever else changes; else a STICK where one is stuck
-    afterwards only, a SLIP where one was before only, else a CROSS. Of several belts the lowest
-    is named.
+    before, after: contact codes, one array per belt, of JAX or of NumPy, any common shape. The
+    event is an EDGE where a belt arrives or leaves, whatever else changes; else a STICK where a
+    belt is stuck only afterwards, a SLIP where one was stuck only before, else a CROSS. If several
+    belts have that event, the lowest is named.
     """
     pairs = list(zip(before, after, strict=True))
     changes = {
@@ -34,7 +34,7 @@ def event_between(before: Sequence[Any], after: Sequence[Any]) -> tuple[Any, Any
         EventKind.SLIP: [(a == 0) & (b != 0) for a, b in pairs],
         EventKind.CROSS: [a != b for a, b in pairs],
     }
-    # What is NumPy's stays so, which compiles nothing.
+    # NumPy arrays are handled by NumPy, which compiles nothing.
     where: Any = np.where if isinstance(before[0], np.ndarray | np.number) else jnp.where
     kind, belt = 0, -1
     for one, changed in reversed(changes.items()):
@@ -47,7 +47,7 @@ def event_between(before: Sequence[Any], after: Sequence[Any]) -> tuple[Any, Any
 
 
 def events_of(modes: np.ndarray | Sequence[Sequence[int]]) -> Signature:
-    """The events of a loop through modes, contact codes [modes, belts], and back to the first."""
+    """The events, in order, of a closed loop through modes, contact codes [modes, belts]."""
     modes = np.asarray(modes)
     if not modes.size:
         return ()  # no belt exerts a force
@@ -56,7 +56,7 @@ def events_of(modes: np.ndarray | Sequence[Sequence[int]]) -> Signature:
 
 
 def of_one_loop(steps: Sequence[Step]) -> tuple[Step, ...]:
-    """The steps of a loop, events or modes, wherever it was begun: the least of the orders."""
+    """The steps of a loop (events or modes) in their least cyclic order, wherever it begins."""
     loop = tuple(steps)
     orders: Any = (loop[i:] + loop[:i] for i in range(len(loop)))
     return min(orders, default=())

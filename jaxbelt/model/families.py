@@ -1,4 +1,4 @@
-"""Oscillators that are linear in parameters: `Family`, what programs know of a variation."""
+"""`Family`: oscillators that are linear in one or two parameters, as data for compiled programs."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -17,10 +17,10 @@ from .oscillator import (
 
 
 class Family(NamedTuple):
-    """Oscillators by one parameter or two, linear in them: what programs know of a variation.
+    """Oscillators that are linear in one or two parameters, as data for compiled programs.
 
-    oscillator: the one at `origin`, [k]; slopes: of each of its leaves by the parameters, [k, ...],
-    None where a leaf is no number.
+    oscillator: the one at the parameters `origin`, [k]; slopes: derivative of each of its leaves by
+    the parameters, [k, ...], None where a leaf is no number.
     """
 
     oscillator: Oscillator
@@ -31,13 +31,13 @@ class Family(NamedTuple):
         """The oscillator at the parameters p, [k]."""
         leaves, structure = jax.tree.flatten(self.oscillator)
         known = is_concrete((self, p))
-        # What is known is taken apart in NumPy, which compiles nothing.
+        # Known arrays are split by NumPy, which compiles nothing.
         one: Any = np if known else jnp
         shift = one.asarray(p) - one.asarray(self.origin)
         for place, (leaf, slope) in enumerate(zip(leaves, self.slopes, strict=True)):
             if slope is None or not (isinstance(slope, Tracer) or np.any(slope)):
                 continue
-            # An edge may be infinite, and a parameter NaN: that moves what depends on it only.
+            # An edge may be infinite, and a parameter NaN: leaves of slope 0 must stay as they are.
             moves = [
                 one.where(row == 0, 0.0, row * by) for row, by in zip(slope, shift, strict=True)
             ]
@@ -45,7 +45,7 @@ class Family(NamedTuple):
         return jax.tree.unflatten(structure, leaves)
 
     def rows(self, values: np.ndarray) -> Oscillator:
-        """Those at many known values, [rows, k], as one with a row in each leaf; as `at`."""
+        """As `at`, for many known values [rows, k]: one oscillator whose leaves have a row each."""
         leaves, structure = jax.tree.flatten(self.oscillator)
         shifts = (values - np.asarray(self.origin)).T
         for place, (leaf, slope) in enumerate(zip(leaves, self.slopes, strict=True)):
@@ -61,8 +61,8 @@ class Family(NamedTuple):
 
     @property
     def units(self) -> Any:
-        """By how much each parameter changes where that number of the oscillator which changes
-        most does so by one, [k]: what parameters are measured in makes no difference to who asks.
+        """Natural unit of each parameter, [k]: the step that changes the most sensitive number of
+        the oscillator by 1. Steps in it do not depend on the units in which parameters are given.
         """
         slopes = [slope for slope in lax.stop_gradient(self.slopes) if slope is not None]
         one: Any = np if is_concrete(slopes) else jnp
@@ -72,17 +72,17 @@ class Family(NamedTuple):
 
     @property
     def unit(self) -> Any:
-        """That of the last parameter."""
+        """Natural unit of the last parameter, see `units`."""
         return self.units[-1]
 
     def belt_slopes(self, belt: int, name: str) -> Any:
-        """Those of a number of a belt, [k]."""
+        """Slopes by the parameters, [k], of the number `name` of a belt, such as "velocity"."""
         slopes = jax.tree.unflatten(jax.tree.structure(self.oscillator), self.slopes)
         return getattr(slopes.belts[belt], name)
 
     def zeros(self, which: Sequence[tuple[int, str]]) -> list[float]:
-        """The value of the one parameter at which a number of a belt, (belt, name), is zero, or two
-        of them are equal; none where that does not change."""
+        """Values of the only parameter at which a number (belt, name) of a belt is zero, or two of
+        them are equal: one value, or none if that number or difference is constant."""
         at = [*(float(getattr(self.oscillator.belts[belt], name)) for belt, name in which), 0.0]
         along = [*(float(self.belt_slopes(belt, name)[0]) for belt, name in which), 0.0]
         if along[0] == along[1]:

@@ -1,14 +1,14 @@
-"""What loops far out do: whether they grow or shrink.
+"""Loops far out, of large amplitude: whether they grow or shrink.
 
-Of a loop of large amplitude A, nearly a circle, viscous damping takes the energy pi zeta A^2, and
-dry friction, which opposes motion, some more, D(A) > 0. Far out loops shrink where
+From a loop of large amplitude A, nearly a circle, viscous damping takes the energy pi zeta A^2, and
+dry friction, which opposes motion, takes a further D(A) > 0. Loops far out shrink where
 
     zeta + lim D(A) / (pi A^2) > 0
 
-and grow where that is negative.
+and grow where this sum is negative.
 
 The limit is 0 for friction that is bounded. Where mu(r) grows as p2 r^2 it is 2/pi u0 p2 omega^2
-for each unit of length of the contact interval, if that is finite; if it is not, D(A) grows as A^3,
+for each unit of length of the contact interval, if this is finite; otherwise D(A) grows as A^3,
 and no loop far out grows. Where mu(r) grows as c r it is u0 c omega for contact everywhere, half of
 that for contact to one side.
 """
@@ -20,15 +20,15 @@ from ..numerics.compiling import jit
 from .friction import AbstractFriction
 from .oscillator import Oscillator
 
-#: Relative velocities at which laws are as they are far out; to both they are to have one growth.
+#: Relative velocities at which the growth of a law is measured; it has to be the same at both.
 FAST = (1e6, 1e8)
-#: Coefficients of growth below these are those of bounded friction.
+#: Coefficients of growth below these count as zero: the friction is bounded.
 LEAST_LINEAR, LEAST_QUADRATIC = 1e-7, 1e-13
 
 
 def contraction_far_out(osc: Oscillator) -> Array:
-    """The rate at which loops far out shrink, as a damping: negative where they grow, inf where
-    friction grows beyond all bounds there."""
+    """The sum above, as a damping: positive where loops far out shrink, negative where they grow,
+    inf where D(A) grows as A^3."""
     contraction = osc.damping
     for belt in osc.belts:
         linear, quadratic = _growth(belt.friction)
@@ -53,12 +53,12 @@ def _growth(law: AbstractFriction, r: float = FAST[1]) -> tuple[Array, Array]:
 
 
 def has_limit(law: AbstractFriction) -> Array:
-    """Whether these numbers determine its growth: those of a square root do not."""
+    """Whether the growth of a law is the same at both speeds `FAST`; a square root's is not."""
     pairs = zip(*(_growth(law, r) for r in FAST), strict=True)
     return jnp.all(jnp.stack([jnp.abs(a - b) <= 1e-4 * (a + b) for a, b in pairs]))
 
 
 @jit
 def is_bounded(osc: Oscillator) -> Array:
-    """Whether loops far out shrink: where these rates are in balance, too, by what D(A) is more."""
+    """Whether loops far out shrink; if the sum is 0 they do, by the lower-order terms of D(A)."""
     return contraction_far_out(osc) >= 0

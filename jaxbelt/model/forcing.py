@@ -9,7 +9,7 @@ they are lengths. Frequencies are angular ones in the time tau: the natural freq
 
 A user's force is a subclass of `AbstractForce` with `frequency` and `force(t)`. A frequency that is
 known to be 0 makes a constant force, or a constant velocity or load; then the oscillator has no
-clock, and all of this package takes it.
+clock, and every function of this package accepts it.
 """
 
 import abc
@@ -37,7 +37,7 @@ from ..checks import (
 )
 from ..dimensions import quantity
 
-#: Dimensions of the fields of waves.
+#: Dimensions of the fields of forces and waves.
 FORCE, FREQUENCY, ANGLE = map(quantity, ("force", "frequency", "angle"))
 
 
@@ -58,8 +58,8 @@ class AbstractForce(_Wave):
     """A periodic force on the mass: subclass it with `frequency` and `force` to define your own.
 
     Attributes:
-        frequency: Angular frequency in the time tau; the period is 2 pi / frequency. 0: none is
-            known.
+        frequency: Angular frequency in the time tau; the period is 2 pi / frequency. 0: no period
+            is known.
 
     Example:
         A short push in each period::
@@ -87,7 +87,7 @@ class AbstractForce(_Wave):
 
     @property
     def fastest(self) -> Array:
-        """The highest frequency in it that matters; steps are short against its period."""
+        """Highest frequency that matters in the force; steps are short against its period."""
         return 8.0 * self.frequency
 
     def bound(self, damping: ArrayLike) -> Array:
@@ -99,12 +99,12 @@ class AbstractForce(_Wave):
         return self.force(t)
 
     def in_units_of(self, force: ArrayLike, length: ArrayLike, time: ArrayLike) -> "AbstractForce":
-        """The same force where these are the units of forces, of lengths and of time."""
+        """The same force in these units of force, length and time."""
         return ForceInUnits(self, force, time)
 
 
 class ForceInUnits(AbstractForce):
-    """A user's force in other units: force(t) is that of `own` at time t, over unit."""
+    """A user's force in other units: force(t) is own.force(time t) / unit."""
 
     own: AbstractForce
     unit: Array
@@ -113,7 +113,7 @@ class ForceInUnits(AbstractForce):
     def __init__(self, own: AbstractForce, unit: Any, time: Any):
         self.own, self.unit, self.time = own, jnp.asarray(unit), jnp.asarray(time)
 
-    # The force's own value: a copy would be a further parameter.
+    # A property: a copy would be a further leaf, that is, a further parameter.
     @property
     def frequency(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.own.frequency * self.time
@@ -183,7 +183,7 @@ class ConstantShift(ConstantForce):
 
 
 class _Sinusoid(AbstractForce):
-    """A force of one wave, by its amplitude, frequency and phase."""
+    """Base of forces of a single wave with an amplitude, a frequency and a phase."""
 
     amplitude: Float[Array, ""] = eqx.field(converter=scalar("amplitude"), metadata=FORCE)
     frequency: Float[Array, ""] = eqx.field(converter=scalar("frequency"), metadata=FREQUENCY)
@@ -281,32 +281,32 @@ class Oscillating(_Wave):
         self.check("Oscillating")
 
     def value(self, t: Array) -> Array:
-        """The value at the time t."""
+        """The value at the time t, any shape."""
         return self.mean + self.amplitude * jnp.cos(self.frequency * t + self.phase)
 
     def rate(self, t: Array) -> Array:
-        """Its derivative by the time."""
+        """Time derivative of the value at the time t."""
         return -self.amplitude * self.frequency * jnp.sin(self.frequency * t + self.phase)
 
     def derivative(self, t: Array, order: int) -> Array:
-        """Its derivative of that order, 1 or more, by the time."""
+        """Time derivative of the value of this order, 1 or more, at the time t."""
         angle = self.frequency * t + self.phase + order * 0.5 * jnp.pi
         return self.amplitude * self.frequency**order * jnp.cos(angle)
 
     def integral(self, start: Array, duration: Array) -> Array:
-        """Its integral over a time from `start` on, exact for small frequencies, too."""
+        """Integral of the value over `duration` from `start` on, exact also for low frequencies."""
         half = 0.5 * self.frequency * duration
         middle = jnp.cos(self.frequency * start + half + self.phase)
         return duration * (self.mean + self.amplitude * middle * jnp.sinc(half / jnp.pi))
 
     def in_units_of(self, unit: ArrayLike, time: ArrayLike) -> "Oscillating":
-        """The same wave where these are the units of the value and of time."""
+        """The same wave in these units of its value and of time."""
         mean, amplitude, frequency = self.mean / unit, self.amplitude / unit, self.frequency * time
         fields = dict(mean=mean, amplitude=amplitude, frequency=frequency, phase=self.phase)
         return unchecked(Oscillating, **fields)
 
     def rules_as(self, field: str) -> list[Rule]:
-        """Its rules as a part of a belt; a load is never negative."""
+        """Rules of the wave as the belt's field of this name; a load must never be negative."""
         rules = [rule._replace(field=f"{rule.field} of {field}") for rule in self.rules()]
         if field in ("load", "normal_force"):
             given = self.mean, self.amplitude
@@ -320,7 +320,7 @@ def _is_never_negative(mean: Any, amplitude: Any) -> Any:
 
 
 def unchecked(kind: type, /, **fields: Any) -> Any:
-    """A module without the checks of its numbers, which those of the user have passed."""
+    """A module made without checks, of numbers derived from the user's, which have passed them."""
     made = object.__new__(kind)
     for name, value in fields.items():
         object.__setattr__(made, name, value)
@@ -328,14 +328,14 @@ def unchecked(kind: type, /, **fields: Any) -> Any:
 
 
 def rate_of_repeats(wave: Any) -> Array:
-    """The frequency with which a wave is known to repeat, 0 where it is constant; nan where that of
-    a user's force is 0: it may be anything."""
+    """Frequency with which a wave repeats, 0 where it is constant; NaN for a user's force with the
+    frequency 0, which may repeat in any way or not at all."""
     known = isinstance(wave, _Sinusoid | Oscillating)
     return wave.frequency if known else jnp.where(wave.frequency == 0, jnp.nan, wave.frequency)
 
 
 def has_amplitude(wave: Any) -> Array:
-    """Whether a wave may be more than a constant, whatever its frequency is."""
+    """Whether a wave's amplitude is not 0; true for a user's force, whose amplitude is unknown."""
     known = isinstance(wave, _Sinusoid | Oscillating)
     return wave.amplitude != 0 if known else jnp.asarray(True)
 
@@ -374,7 +374,7 @@ def _cosine(phase: Array) -> Array:
 
 
 def as_forcing(forcing: Any) -> tuple[AbstractForce, ...]:
-    """The forces as a tuple, constant ones as such; or a `ValueError`."""
+    """The forces as a tuple, those of frequency 0 as `ConstantForce`; or a `ValueError`."""
     expected = "a force such as jb.Harmonic(...), or a tuple of them"
     if isinstance(forcing, AbstractForce):
         forcing = (forcing,)
@@ -396,7 +396,7 @@ def _without_frequency(force: AbstractForce) -> AbstractForce:
     return unchecked(kind, amplitude=force.amplitude, phase=phase)
 
 
-#: Users' forces whose `force` was traced.
+#: Classes of users' forces whose `force` was traced without error.
 _traced_forces: set[type] = set()
 
 

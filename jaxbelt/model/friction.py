@@ -39,7 +39,7 @@ from ..checks import (
     traceable,
 )
 
-#: Rounding that mu(0) may have, over 1 + static.
+#: Allowed rounding of mu(0), relative to 1 + static.
 MU_ROUNDING = 1e-14
 
 
@@ -67,7 +67,7 @@ class AbstractFriction(Parameters):
         """
 
     def fraction(self, speed: Array) -> tuple[Array, Array]:
-        """mu(speed) as (numerator, denominator), denominator > 0; kernels divide last."""
+        """mu(speed) as (numerator, denominator > 0), so that kernels divide once, at the end."""
         return self.mu(speed), jnp.ones_like(speed)
 
     @property
@@ -85,10 +85,10 @@ class AbstractFriction(Parameters):
 
 
 def _of_static(static: ArrayLike, begins: ArrayLike) -> list[Rule]:
-    """Rules of a law with this mu(0)."""
+    """Rules of a law with this static coefficient and mu(0) = begins."""
     most = static + MU_ROUNDING * (1 + static)
     bound = Rule("mu(0)", (begins, static, most), _is_at_most, "<= static = {1}")
-    # A negative coefficient pushes: such a belt holds the mass and releases it at once.
+    # A negative coefficient pushes: such a belt would hold the mass and release it at once.
     least = Rule("mu(0)", (begins, -MU_ROUNDING), operator.ge, ">= 0")
     return [*be_nonnegative("static", static), least, bound]
 
@@ -97,8 +97,8 @@ def _is_at_most(value: Any, _: Any, most: Any) -> Any:
     return value <= most
 
 
-#: Users' laws whose `mu` was traced, with the fields that were None; and those that were searched
-#: for kinks.
+#: Classes of users' laws whose `mu` was traced, each with its fields that were None; and classes
+#: that were searched for kinks.
 _traced: set[tuple[Any, ...]] = set()
 _asked_of_kinks: set[type] = set()
 
@@ -106,9 +106,9 @@ _asked_of_kinks: set[type] = set()
 def check_law(law: AbstractFriction) -> None:
     """Raises a `ValueError` if a user's law cannot be used.
 
-    That is if a field is neither a number nor static, or if its `mu` cannot be traced, the latter
-    once for each class and set of fields that are None. A law that calls NumPy's exponential
-    returns right numbers alone and fails inside compiled programs.
+    A law cannot be used if a field is neither a number nor static, or if `mu` cannot be traced,
+    which is tried once for each class and set of fields that are None. (A law that calls NumPy's
+    exponential gives right numbers by itself and fails inside compiled programs.)
     """
     kind = type(law)
     if kind.__module__ == __name__:
@@ -162,18 +162,18 @@ def _warn_of_kink(law: AbstractFriction) -> None:
 
 #: Speeds between which jumps and kinks are searched, and how often their intervals are halved.
 SEARCHED, HALVINGS = np.logspace(-5, 3, 2049), 30
-#: A slope that jumps by less than LEAST_KINK of itself, or by less than LEAST_BEND of mu / speed,
-#: has no kink beyond rounding; nor has mu a jump if it jumps by less than LEAST_JUMP.
+#: Changes below these are rounding: of the slope, LEAST_KINK of itself or LEAST_BEND of mu / speed;
+#: of mu, LEAST_JUMP of itself.
 LEAST_KINK, LEAST_BEND, LEAST_JUMP = 1e-3, 1e-6, 1e-6
 
 
-#: A speed, and the values before and behind it.
+#: A speed, and the values just below and just above it.
 Change = tuple[float, float, float]
 
 
 def jump_and_kink(law: AbstractFriction) -> tuple[Change | None, Change | None]:
-    """The largest jump of mu of a known law, and the largest of its slope; None where there is
-    none."""
+    """The largest jump of mu of a law with known numbers, and the largest jump of its slope; None
+    where there is none."""
     own = law.law if isinstance(law, LawInUnits) else law
     if type(own).__module__ == __name__:
         return None, None  # these are smooth
@@ -196,7 +196,7 @@ def jump_and_kink(law: AbstractFriction) -> tuple[Change | None, Change | None]:
         mu = after[0]
         for _ in range(HALVINGS):
             middle = 0.5 * (low + high)
-            # As many as before, so that nothing is compiled again.
+            # Filled up to the length of `speeds`, so that nothing is compiled again.
             filled = np.append(middle, np.ones((2, 1)), axis=1)
             between = np.asarray(asked(jnp.asarray(filled)))[:, :-1]
             left = np.abs(between - before) > np.abs(after - between)
@@ -211,8 +211,8 @@ def jump_and_kink(law: AbstractFriction) -> tuple[Change | None, Change | None]:
 def _largest(
     at: np.ndarray, before: np.ndarray, after: np.ndarray, least: np.ndarray
 ) -> Change | None:
-    """The largest change that is no less than the least: its place, and the values on both
-    sides."""
+    """The largest of the changes above `least`: its speed, and the values on both sides; None if
+    there is none."""
     changes = np.abs(after - before)
     found = np.flatnonzero(changes > least)
     if not len(found):
@@ -222,7 +222,7 @@ def _largest(
 
 
 def as_friction(law: Any) -> AbstractFriction:
-    """The law, or a `ValueError` if it is none."""
+    """The law itself, or a `ValueError` if it is no friction law."""
     fits = isinstance(law, AbstractFriction)
     require_value(fits, "friction", "a law such as jb.Conti(...)", law)
     check_law(law)
@@ -239,7 +239,7 @@ class LawInUnits(AbstractFriction):
     def __init__(self, law: AbstractFriction, unit: Array):
         self.law, self.unit = law, unit
 
-    # The law's own value: a copy would be a further parameter.
+    # A property: a copy would be a further leaf, that is, a further parameter.
     @property
     def static(self) -> ArrayLike:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.law.static
@@ -257,7 +257,7 @@ class LawInUnits(AbstractFriction):
 
     def in_units_of(self, speed: Array) -> AbstractFriction:
         unit = self.unit * speed
-        # There and back again it is the law itself, up to rounding.
+        # A law that is converted there and back is the law itself, up to rounding.
         is_own = is_concrete(unit) and np.all(np.abs(np.asarray(unit) - 1.0) < 1e-15)
         return self.law if is_own else LawInUnits(self.law, unit)
 
@@ -392,7 +392,7 @@ class Cubic(AbstractFriction):
 
     Args:
         a0: Static coefficient >= 0, a dimensionless scalar.
-        a1: Initial slope, likewise.
+        a1: Initial decrease, mu'(0) = -a1, likewise.
         a3: Cubic coefficient, likewise.
 
     Raises:
@@ -409,7 +409,7 @@ class Cubic(AbstractFriction):
     def __check_init__(self):
         self.check("Cubic")
 
-    # The law's own value: a copy would be a further parameter.
+    # A property: a copy would be a further leaf, that is, a further parameter.
     @property
     def static(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.a0
@@ -430,8 +430,8 @@ def _of_static_and_kinetic(static: ArrayLike, kinetic: ArrayLike) -> list[Rule]:
     return [*rules, Rule("kinetic", (kinetic, static), operator.le, "<= static = {1}")]
 
 
-#: How far the curve of a table may leave the range of its points, over the largest coefficient. For
-#: laws that fall and level out at most 0.028 was seen, which hardly shows in a picture.
+#: How far the curve of a table may leave the range of the points beside, over the largest
+#: coefficient. For laws that fall and level out at most 0.028 was seen, hardly visible in a plot.
 MOST_ASTRAY = 0.03
 
 
@@ -442,12 +442,12 @@ class Tabulated(AbstractFriction):
     multiquadrics: h_i is the distance of r_i from the nearer of its neighbours, and the w_i, whose
     sum is zero, are such that mu(r_i) = mu_i. The curve has all derivatives, keeps close to
     straight lines between the points, and levels out beyond the last one; a warning says where it
-    does not. Motions that slip faster than the last point depend on that: in a stick-slip cycle
-    speeds reach about twice the belt's velocity. The curve follows scatter in the table, too:
-    smooth it before. See R. L. Hardy, Multiquadric equations of topography and other irregular
-    surfaces, J. Geophys. Res. 76 (1971) 1905-1915.
+    does not. Motions that slip faster than the last point depend on the curve beyond it: in a
+    stick-slip cycle speeds reach about twice the belt's velocity. The curve follows scatter, too:
+    smooth such tables first. See R. L. Hardy, Multiquadric equations of topography and other
+    irregular surfaces, J. Geophys. Res. 76 (1971) 1905-1915.
 
-    The numbers of the table are known and no parameters, so that another table compiles anew.
+    The numbers of the table are static, not parameters, so another table compiles anew.
 
     Args:
         speeds: Speeds r_i, increasing, >= 0, two or more.
@@ -476,7 +476,7 @@ class Tabulated(AbstractFriction):
         matrix = np.block([[basis, one], [one.T, np.zeros((1, 1))]])
         *weights, _ = np.linalg.solve(matrix, np.append(coefficients, 0.0)).tolist()
         self.weights = tuple(weights)
-        # Exact at the first point, which is mostly the static one.
+        # Makes the curve exact at the first point, mostly speed 0, the static coefficient.
         self.level = float(coefficients[0] - np.sum(weights * basis[0]))
         off = np.max(np.abs(basis @ weights + self.level - coefficients))
         fits = off <= 1e-9 * np.max(coefficients)
@@ -491,7 +491,7 @@ class Tabulated(AbstractFriction):
         """Warns if the curve leaves the range of its points, as where gaps of the table differ
         much."""
         speeds, mus = np.array(self.speeds), np.array(self.coefficients)
-        # Beyond the last point it may go on as far as over the last gap, but must not push.
+        # Beyond the last point mu may change as much as over the last gap, but must not push.
         beyond = max(0.0, 2.0 * mus[-1] - mus[-2])
         ends, steps = np.append(speeds, 3.0 * speeds[-1]), np.append(mus, beyond)
         at = np.concatenate([np.linspace(*gap, 65) for gap in itertools.pairwise(ends)])
@@ -532,7 +532,7 @@ class Tabulated(AbstractFriction):
         return _of_static(np.asarray(self.static) if known else self.static, self._begins)
 
     def __repr__(self) -> str:
-        # All of it, because stores are identified by this text.
+        # The whole table, because stores of results are identified by this text.
         columns = (", ".join(map("{:.12g}".format, c)) for c in (self.speeds, self.coefficients))
         return "Tabulated([{}], [{}], static={})".format(*columns, number(self.static))
 

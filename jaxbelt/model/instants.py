@@ -1,17 +1,17 @@
-"""With a clock: what follows at an instant, and the smooth motion between such instants.
+"""Oscillators with a clock: events at an instant, and the smooth motion between events.
 
-A state is y = (x1, x2, t), t' = 1. At an instant the oscillator is that of `at_time`, and forces,
-guards and contacts are asked of it. What belts whose velocity or load oscillates add:
+A state is y = (x1, x2, t), t' = 1. At an instant the oscillator is the one that `at_time` gives,
+and its forces, guards and contacts hold. Belts whose velocity or load oscillates add the following:
 
 - Belts are mates, and hold the mass together, only if their velocities are the same at all times;
-  of others that come to one velocity for an instant the mass may stick to one.
-- A mass that sticks follows the belt; its x1 is the integral of the belt's velocity.
+  where belts that are no mates have one velocity for an instant, the mass may stick to one of them.
+- A stuck mass follows its belt; x1 is the integral of the belt's velocity.
 - A stick phase ends where capacity - needed or capacity + needed vanishes, at an edge, or where the
   relative velocity of another touching belt passes zero, after which the mass sticks on, goes over
   to that belt, or slips.
 
-`guards_at` has all of these, and those of slip modes, in one row: n boundaries, 2n edges, and the
-two limits.
+`guards_at` has all of these guards, and those of slip modes, in one row: n boundaries, 2n edges,
+and the two limits of a stick phase.
 """
 
 import functools
@@ -49,15 +49,15 @@ from .transitions import codes_past_edge, edge_of_guard, is_passed_rightward, la
 
 #: A state with a clock, (x1, x2, t).
 TimedState = tuple[Array, Array, Array]
-#: A guard is zero up to rounding below this, times the size of what it is made of; velocities are
-#: equal at an instant up to this fraction.
+#: A guard below GUARD_ROUNDING times the size of its terms is zero up to rounding; velocities that
+#: differ by less than the fraction EQUAL_VELOCITY are equal at an instant.
 GUARD_ROUNDING, EQUAL_VELOCITY = 1e-14, 2e-15
-#: Slopes and curvatures of a limit below these are zero; then the limit is asked a little later.
+#: Slopes and curvatures of a limit below these count as zero; then its value LATER on decides.
 LEAST_SLOPE, LEAST_CURVATURE, LATER = 1e-12, 1e-10, 1e-3
 
 
 def blur(t: Array) -> Array:
-    """How the rounding of waves grows with the time."""
+    """Factor by which the rounding of waves is larger at the time t than at 0."""
     return 1 + 0.1 * jnp.abs(t)
 
 
@@ -65,7 +65,7 @@ def blur(t: Array) -> Array:
 
 
 def field_at(osc: Oscillator, mode: Mode, y: TimedState) -> TimedState:
-    """The field (x1', x2', t') of a mode; the mass that sticks goes with its belt."""
+    """The field (x1', x2', t') of a mode; a stuck mass moves with its belt."""
     x1, x2, t = y
     now = at_time(osc, t)
     rate = stick_rate(now, mode) / osc.omega
@@ -74,7 +74,7 @@ def field_at(osc: Oscillator, mode: Mode, y: TimedState) -> TimedState:
 
 
 def carried(osc: Oscillator, mode: Mode, y: TimedState, duration: Array) -> TimedState:
-    """The state a time later of a mass that sticks, in closed form."""
+    """The state of a stuck mass after `duration`, in closed form."""
     x1, _, t = y
     now, later = at_time(osc, t), at_time(osc, t + duration)
     ways = [
@@ -87,8 +87,8 @@ def carried(osc: Oscillator, mode: Mode, y: TimedState, duration: Array) -> Time
 
 
 def guards_at(osc: Oscillator, mode: Mode, y: TimedState) -> Array:
-    """The guards of a mode, positive inside, inf where there is none: n boundaries (of a mass that
-    sticks those of the other belts), 2n edges, capacity - needed and capacity + needed."""
+    """The guards of a mode, positive inside, inf where there is none: n boundaries (while the mass
+    sticks, those of the other belts), 2n edges, capacity - needed and capacity + needed."""
     x1, x2, t = y
     now = at_time(osc, t)
     others = [*boundary_guards(now, mode, x2), *edge_guards(now, mode, x1)]
@@ -112,7 +112,7 @@ class Trend(NamedTuple):
 def trend_of(
     osc: Oscillator, mode: Mode, guards: Callable[[TimedState], Array], y: TimedState
 ) -> Trend:
-    """Guards at a state and how they change in the motion of the mode."""
+    """Guards at a state and how they change along the motion of the mode."""
 
     def rate(*y):
         return jax.jvp(lambda *y: guards(y), y, field_at(osc, mode, y))
@@ -122,12 +122,12 @@ def trend_of(
 
 
 def guards_trend(osc: Oscillator, mode: Mode, y: TimedState | Array) -> Trend:
-    """The guards of a mode, and how they change in its motion, at a state, also in an array [3]."""
+    """`trend_of` the guards of a mode at a state, a tuple or an array [3]."""
     return trend_of(osc, mode, lambda y: guards_at(osc, mode, y), (y[0], y[1], y[2]))
 
 
 def guard_sizes(osc: Oscillator, y: TimedState) -> Array:
-    """The size of the numbers of which guards are made, with what the time adds to rounding."""
+    """Size of the terms of the guards, times `blur`: the scale of the guards' rounding."""
     x1, x2, t = y
     now = at_time(osc, t)
     forces = [belt.load * belt.friction.static for belt in now.belts]
@@ -173,7 +173,7 @@ def is_faster(osc: Oscillator, i: int, k: int, t: Array) -> Array:
 def _holds(osc: Oscillator, mode: Mode, y: TimedState) -> Array:
     """Whether the belts that are stuck in a mode hold the mass from now on.
 
-    At the limit itself the way that it goes from there decides.
+    At a limit itself the mass is held if capacity -+ needed grows from there.
     """
     osc, mode, y = lax.stop_gradient((osc, mode, y))
 
@@ -198,12 +198,12 @@ def _holds(osc: Oscillator, mode: Mode, y: TimedState) -> Array:
 def resolved(
     osc: Oscillator, mode: Mode, zero: Sequence[Array], first: Sequence[Array], y: TimedState
 ) -> tuple[Mode, Array]:
-    """The mode from a state on in which some belts have r = 0, and x2' there.
+    """The mode in which the motion goes on from a state where some belts have r = 0, and its x2'.
 
-    zero: which touching belts; their codes in `mode` do not count. Each velocity among them is
-    tried: the belts of that velocity have to hold the mass, while the signs of the others are those
-    just afterwards. first: numbers of belts that are tried before the others, -1 for none. Where no
-    belt holds, the mass slips with the signs that agree with its acceleration.
+    zero: masks, one per belt, of touching belts with r = 0; their codes in `mode` do not count.
+    Each velocity among them is tried: the belts of that velocity have to hold the mass, and the
+    others slip with their signs just afterwards. first: numbers of belts that are tried before the
+    others, -1 for none. Where no belt holds, the mass slips with signs that fit its acceleration.
     """
     n, t = len(osc.belts), y[2]
     now = at_time(osc, t)
@@ -220,7 +220,7 @@ def resolved(
         for k in range(n)
     ]
     held = [zero[k] & _holds(osc, sticks[k], y) for k in range(n)]
-    # The acceleration of each belt, over omega, and of the mass if it slips.
+    # The acceleration of each belt, over omega; then the candidates for the slip mode.
     rates = [
         belt.rate / osc.omega if isinstance(belt, MovingBelt) else jnp.zeros(())
         for belt in now.belts
@@ -252,7 +252,7 @@ def resolved(
 
 
 def at_zero(osc: Oscillator, mode: Mode, y: TimedState, k: Array) -> list[Array]:
-    """Which touching belts have r = 0; k: the number of one that has, -1 where none is known."""
+    """Masks, one per belt, of touching belts with r = 0; k: number of one of them, or -1."""
     _, x2, t = y
     n = len(osc.belts)
     now = at_time(osc, t)
@@ -271,8 +271,8 @@ def at_zero(osc: Oscillator, mode: Mode, y: TimedState, k: Array) -> list[Array]
 
 
 def begun_at(osc: Oscillator, y: TimedState) -> tuple[Mode, Array]:
-    """The mode of a start, and whether it is a pseudo-focus: at rest on an edge to which it is
-    pushed from both sides for ever."""
+    """The mode of a start, and whether the start is a pseudo-focus: at rest on an edge, with both
+    sides pushing the mass to it at all times."""
     sides = [_start_on_side(osc, y, rightward) for rightward in (False, True)]
     (left, a_left), (right, a_right) = sides
     if not has_edges(osc):
@@ -309,7 +309,7 @@ def _start_on_side(osc: Oscillator, y: TimedState, rightward: bool) -> tuple[Mod
 
 
 class Instant(NamedTuple):
-    """How a motion goes on from an instant: state, mode, and whether it is lost at an edge."""
+    """How a motion goes on from an instant: state, mode, and whether a pseudo-focus captured it."""
 
     y: TimedState
     mode: Mode
@@ -335,15 +335,15 @@ def on_guard_at(osc: Oscillator, mode: Mode, guard: Array, y: TimedState) -> Tim
 
 
 def passed_guard(osc: Oscillator, mode: Mode, guard: Array, y: TimedState) -> Instant:
-    """What follows where the guard of that number in `guards_at` vanishes; -1: nothing does.
+    """How the motion goes on where the guard of this number in `guards_at` vanishes; -1: no guard.
 
-    y: put on the guard already, see `on_guard_at`.
+    y: the state, which `on_guard_at` has put on the guard.
     """
     n = len(osc.belts)
     x2, t = y[1], y[2]
     stuck = mode.any_stuck
     held_by = first_of(mode.stuck, [jnp.asarray(i) for i in range(n)], jnp.asarray(-1))
-    # A boundary, or another belt's while it sticks: belts of that velocity ask anew.
+    # At a boundary (of another belt, while the mass sticks) all belts with r = 0 are decided anew.
     at_boundary = (guard >= 0) & (guard < n)
     k = jnp.where(stuck, held_by, guard)
     zero = at_zero(osc, mode, y, k)
@@ -352,7 +352,7 @@ def passed_guard(osc: Oscillator, mode: Mode, guard: Array, y: TimedState) -> In
     zero = [one | mate & touches for one, mate, touches in rows]
     met, _ = resolved(osc, mode, zero, [k, guard], y)
     after = select(at_boundary, met, mode)
-    # A limit: friction opposed the force that was needed.
+    # At a limit of a stick phase slip begins; friction has opposed the needed force until then.
     upper, lower = guard == 3 * n, guard == 3 * n + 1
     sign = jnp.where(upper, -1.0, 1.0)
     slip = mode.slipping(sign)
@@ -362,7 +362,7 @@ def passed_guard(osc: Oscillator, mode: Mode, guard: Array, y: TimedState) -> In
         at_edge = (guard >= n) & (guard < 3 * n)
         rightward = is_passed_rightward(mode, guard)
         beyond = codes_past_edge(at_time(osc, t), mode, y[0], osc.omega * x2, rightward)
-        # A sign for those with r = 0, which are resolved below.
+        # Belts with r = 0 get a provisional sign; they are resolved below.
         beyond = beyond.slipping(1.0)
         beyond = Mode(
             tuple(
@@ -387,10 +387,10 @@ def passed_guard(osc: Oscillator, mode: Mode, guard: Array, y: TimedState) -> In
 
 
 def is_held_for_ever(osc: Oscillator, mode: Mode, y: TimedState) -> Array:
-    """Whether a mass stays stuck whatever the clock says: on belts at rest, and other touching
-    belts constant, while what is needed with all forces at their largest is within the capacity.
+    """Whether a mass stays stuck at all times: its belts are at rest, the other touching belts are
+    constant, and the needed force with all forces at their largest is within the capacity.
 
-    Where that is not known the answer is no.
+    False where this is not known.
     """
     still, limit = mode.any_stuck, jnp.zeros(())
     for belt, touches, stuck in zip(osc.belts, mode.touching, mode.stuck, strict=True):
@@ -410,9 +410,9 @@ def is_held_for_ever(osc: Oscillator, mode: Mode, y: TimedState) -> Array:
 
 
 def _pushes_for_ever(osc: Oscillator, mode: Mode, y: TimedState, sign: ArrayLike) -> Array:
-    """Whether the acceleration of a slip mode at a place has that sign whatever the clock says.
+    """Whether the acceleration of a slip mode at the state y has this sign at all times.
 
-    Where that is not known, as with belts that oscillate, the answer is no.
+    False where this is not known, as with belts that oscillate.
     """
     rest, bound = _pushes(osc, mode, y)
     return _are_constant(osc, mode) & (sign * rest > bound)
@@ -428,13 +428,13 @@ def _are_constant(osc: Oscillator, mode: Mode) -> Array:
 
 
 def _pushes(osc: Oscillator, mode: Mode, y: TimedState) -> tuple[Array, Array]:
-    """The acceleration of a mode without waves of force, and a bound of these at all times."""
+    """Acceleration of a mode without the forces that have a clock, and a bound of their sum."""
     now, (force, bound) = at_time(osc, y[2]), _force_and_bound(osc, y[2])
     return mode_acceleration(now, mode, y[0], y[1]) - force, bound
 
 
 def _force_and_bound(osc: Oscillator, t: Array) -> tuple[Array, Array]:
-    """The sum of the waves of force at the time t, and a bound of it at all times."""
+    """The sum of the forces that have a clock at the time t, and a bound of it at all times."""
     waves, zero = [one for one in osc.forcing if not isinstance(one, ConstantForce)], jnp.zeros(())
     forces = [one.on_mass(t, osc.damping) for one in waves]
     bounds = [one.bound(osc.damping) for one in waves]
@@ -442,6 +442,6 @@ def _force_and_bound(osc: Oscillator, t: Array) -> tuple[Array, Array]:
 
 
 def _forces_around(osc: Oscillator, t: Array) -> ForceRange:
-    """What the waves of force may add, at other times, to what they are at the time t."""
+    """Range of the change of the forces that have a clock from the time t to any other time."""
     force, bound = _force_and_bound(osc, t)
     return ForceRange(-bound - force, bound - force, fastest(osc))

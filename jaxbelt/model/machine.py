@@ -1,4 +1,4 @@
-"""A machine in SI units, and the dimensionless oscillator that it is.
+"""A machine in SI units, and the dimensionless oscillator that describes it.
 
     m X'' = -k X - c X' + sum over touching belts of  N_i mu_i(|R_i|) sgn(R_i) + sum of P_j(t),
     R_i = V_i - X'
@@ -77,7 +77,7 @@ class Units(eqx.Module):
         return f"Units({', '.join(parts)})"
 
 
-#: Units of dimensions: the symbol, and the value of 1 in it.
+#: SI unit of each dimension: its symbol, and the size of the dimensionless unit in it.
 SI_UNITS: dict[str, tuple[str, Callable[[Units], Any]]] = {
     "time": ("s", lambda units: units.time),
     "length": ("m", lambda units: units.length),
@@ -180,7 +180,7 @@ class Machine(KnownNames):
     def units(self) -> Units:
         """One unit of each dimensionless quantity, in SI units."""
         largest = jnp.max(jnp.stack([_largest_force(belt.normal_force) for belt in self.belts]))
-        # Without any force on a belt there is no natural length.
+        # Without a normal force on any belt there is no natural length.
         length = jnp.where(largest > 0, largest / self.stiffness, 1.0)
         time, force = jnp.sqrt(self.mass / self.stiffness), self.stiffness * length
         return Units(time, length, length / time, force, force * length)
@@ -289,8 +289,8 @@ def _si_numbers(value: Any, field: str) -> Array:
 
 
 def _over(value: Array, unit: Array) -> Array:
-    """A quotient that is the same for a number and as one of many, which XLA may multiply by the
-    reciprocal."""
+    """value / unit, by NumPy for known numbers: a number alone and one of many give the same
+    quotient, while XLA may multiply many by the reciprocal."""
     if is_concrete((value, unit)):
         return jnp.asarray(np.asarray(value) / np.asarray(unit))
     return value / unit

@@ -8,8 +8,8 @@ A mode holds one contact code a belt:
 
 In a slip mode the friction keeps the sign of the mode, not sgn(r_i). So the field of a mode is
 smooth across the mode's own boundaries, and events, derivatives and Newton iterations are right.
-An orbit leaves a mode where one of its guards, positive inside, vanishes; `transitions` say how it
-goes on.
+An orbit leaves a mode where one of its guards, positive inside, vanishes; `transitions` decides how
+it goes on.
 
 Everything here is elementwise: codes and states may be scalars (the trajectories of `simulate`)
 or arrays of lanes (the kernel of `sweeps.queue`), belts are unrolled.
@@ -37,12 +37,12 @@ from .oscillator import (
 
 Tree = TypeVar("Tree")
 STUCK, BELOW, ABOVE = 0.0, -2.0, 2.0
-#: Numbers that differ by less than this fraction are equal: so much do nu and omega (nu/omega).
+#: Numbers that differ by less than this fraction are equal: the rounding of omega (nu / omega).
 ULPS = 4e-16
 
 
 class Mode(eqx.Module):
-    """Contact codes, one array a belt (float64, any common batch shape); see the module's text."""
+    """Contact codes, one array per belt (float64, any batch shape); see the module's text."""
 
     codes: tuple[Array, ...]
 
@@ -60,14 +60,14 @@ class Mode(eqx.Module):
 
     @property
     def signs(self) -> tuple[Array, ...]:
-        """The signs for `acceleration`: 0 for the stuck and the absent."""
+        """The signs for `acceleration`: 0 for belts that are stuck or do not touch."""
         return tuple(
             jnp.where(touches, code, 0.0)
             for code, touches in zip(self.codes, self.touching, strict=True)
         )
 
     def slipping(self, sign: float | Array) -> "Mode":
-        """The mode in which the belts that are stuck slip with a sign."""
+        """The mode in which the belts that are stuck slip with this sign instead."""
         return Mode(tuple(jnp.where(code == STUCK, sign, code) for code in self.codes))
 
 
@@ -80,7 +80,7 @@ def any_of(flags: Sequence[Any]) -> Any:
 
 
 def first_of(flags: Sequence[Array], values: Sequence[Array], default: Array) -> Array:
-    """Elementwise the value of the first flag that is set, or `default`."""
+    """Elementwise the value whose flag is the first one set, or `default`."""
     out = default
     for flag, value in zip(reversed(flags), reversed(values), strict=True):
         out = jnp.where(flag, value, out)
@@ -90,12 +90,12 @@ def first_of(flags: Sequence[Array], values: Sequence[Array], default: Array) ->
 def foremost(
     osc: Oscillator, flags: Sequence[Array], values: Sequence[Array], default: Array
 ) -> Array:
-    """Elementwise the value of the belt with the largest load of those whose flag is set.
+    """Elementwise the value of the belt with the largest load among those whose flag is set.
 
-    The values of these are equal, for their belts act at one place; the derivatives are then those
-    of a belt that exerts a force. flags, values: one a belt, or one a belt several times over.
-    `default` where no flag is set. A load that oscillates counts by its mean, so that the choice is
-    the same at all times.
+    These values are equal, because the belts act at one place, but their derivatives differ: this
+    choice takes those of a belt that exerts a force. flags, values: one per belt, or several rows
+    of one per belt. `default` where no flag is set. A load that oscillates counts by its mean, so
+    that the choice is the same at all times.
     """
     out, largest = default, jnp.asarray(-jnp.inf)
     loads = [b.load.mean if isinstance(b.load, Oscillating) else b.load for b in osc.belts]
@@ -136,25 +136,25 @@ def fastest_rate(a_by_x2: Array) -> Array:
     return jnp.where(half > 1, half + jnp.sqrt(jnp.maximum(half * half - 1, 0.0)), 1.0)
 
 
-#: Time in which x2' grows e-fold in a layer that is thin, and by how many tolerances an error there
-#: may delay the motion; see `share_of_tolerance`.
+#: A layer is thin if x2' grows e-fold in less than LAYER; an error in it may delay the motion by
+#: DELAY tolerances; see `share_of_tolerance`.
 LAYER, DELAY = 0.01, 10.0
 #: Rounding of x2 in a step, over x2.
 X2_ROUNDING = 5e-15
 
 
 def share_of_tolerance(rise: Array, a_start: Array, a_end: Array, rtol: ArrayLike) -> Array:
-    """The share of its tolerance that an error of x2 may have, in a step of an integrator.
+    """The share of the tolerance that the error of x2 may use in a step of an integrator.
 
-    It is 1 but in a step out of a thin layer. Slip onset is an unstable point: where the law falls
-    steeply, x2' grows from there like exp(t / LAYER) or faster, and an error of x2 grows with it.
-    What remains of it is a delay, the error over x2', which may be `DELAY` tolerances.
+    It is 1 except in a step out of a thin layer. Slip onset is an unstable point: where the law
+    falls steeply, x2' grows from there like exp(t / LAYER) or faster, and an error of x2 with it.
+    What remains of the error is a delay, the error over x2', which may be `DELAY` tolerances.
 
     Args:
         rise: Change of x2 in the step, relative to the belt where belts move.
-        a_start: x2' at its start, likewise.
-        a_end: x2' at its end, likewise.
-        rtol: The relative tolerance; no error is asked for that is below rounding.
+        a_start: x2' at the start of the step, likewise relative to the belt.
+        a_end: x2' at the end of the step, likewise.
+        rtol: The relative tolerance; the share never asks for errors below rounding.
     """
     change = jnp.abs(a_end - a_start)
     grows = (jnp.abs(rise) < LAYER * change) & (jnp.abs(a_end) > jnp.abs(a_start))
@@ -181,17 +181,16 @@ def _of_stuck(osc: Oscillator, mode: Mode, coefficients: Sequence[ArrayLike]) ->
 
 
 def force_rounding(x1: Any, scale: Array | float = 1.0) -> Any:
-    """A force, or x2', below this is 0 up to rounding, wherever that is asked.
+    """Rounding of forces and of x2' at x1: smaller ones count as 0 in all of this package.
 
-    Forces at x1 are sums of terms of size `scale` and |x1|, each good to some 1e-16 of itself; but
-    x1 and x2 may come from an integrated arc, whose end is found to about 1e-13.
+    Forces at x1 are sums of terms of size `scale` and |x1|, each accurate to about 1e-16 of itself;
+    but x1 and x2 may come from an integrated arc, whose end is accurate to about 1e-13.
     """
     return 1e-12 * (scale + abs(x1))
 
 
 def distinct_places(places: np.ndarray) -> np.ndarray:
-    """The numbers of those places that are finite, from left to right, of several that are one up
-    to rounding the first."""
+    """Sorted indices of the finite places; places equal up to rounding are merged."""
     order = np.argsort(places)
     order = order[np.isfinite(places[order])]
     known = places[order]
@@ -199,20 +198,20 @@ def distinct_places(places: np.ndarray) -> np.ndarray:
 
 
 def without_rounding(a: Array, x1: Array) -> Array:
-    """x2' at x1, and 0 where it is 0 up to rounding, as at slip onset; its derivatives stay."""
+    """x2' at x1, set to 0 where it is rounding, as at slip onset; its derivatives are kept."""
     return jnp.where(jnp.abs(a) < force_rounding(x1), a - lax.stop_gradient(a), a)
 
 
 def settle(osc: Oscillator, mode: Mode, x1: Array, x2: Array, held: Array | None = None) -> Mode:
     """Keep the stuck belts of `mode` stuck if they can hold the needed force, else let them slip.
 
-    held: what they can hold together; None: their `capacity`.
+    held: the largest force that they can hold together; None: their `capacity`.
 
     They slip with sign -sgn(needed): friction opposed the needed force until the limit. That one
     rule serves arrivals at a boundary (not held: the orbit crosses), contact edges met while
     sticking (not held: torn off) and starts on a boundary. Belts of equal velocity are stuck
-    together, their capacities add and their signs flip together. What can hold nothing never
-    sticks; where no force is needed either, r'' = omega^2 x2 gives the sign.
+    together, their capacities add and their signs flip together. Belts that can hold nothing never
+    stick; where no force is needed either, r'' = omega^2 x2 gives the sign.
     """
     needed = mode_acceleration(osc, mode, x1, x2)
     held = capacity(osc, mode) if held is None else held
@@ -245,7 +244,7 @@ def boundary_guards(osc: Oscillator, mode: Mode, x2: Array) -> list[Array]:
 
 
 def edge_guards(osc: Oscillator, mode: Mode, x1: Array) -> list[Array]:
-    """Distances to the edges that bound the mode: the lower ones of all belts, then the upper."""
+    """Distances to the edges that bound the mode: lower edges of all belts, then upper; or inf."""
     if not has_edges(osc):
         return [jnp.full_like(x1, jnp.inf)] * (2 * len(osc.belts))
     lower = [
@@ -272,19 +271,19 @@ def bounds_leftward(mode: Mode) -> list[Array]:
 
 
 def edges_ahead(mode: Mode, v: Array) -> list[Array]:
-    """For each of `edge_guards`, whether a mass with the velocity v (or its sign) moves to it."""
+    """For each of `edge_guards`, whether a mass with velocity v (or its sign) moves towards it."""
     sides = zip(bounds_rightward(mode), bounds_leftward(mode), strict=True)
     return [(v > 0) & on_right | (v < 0) & on_left for on_right, on_left in sides]
 
 
 def edges(osc: Oscillator) -> list[Array]:
-    """Positions of the contact edges in the order of `edge_guards`; infinite: there is none."""
+    """Positions of the contact edges in the order of `edge_guards`; infinite for no edge."""
     bounds = interval_ends(osc)
     return [jnp.asarray(float(x)) if isinstance(x, NoEdge) else x for x in bounds]
 
 
 def edge_at(osc: Oscillator, number: int | Array) -> Array:
-    """The place of the edge of that number in `edges`."""
+    """x1 of the edge with this number in `edges`."""
     return jnp.stack(edges(osc))[number]
 
 
@@ -300,7 +299,7 @@ def zone_ends(osc: Oscillator) -> tuple[Array, Array]:
 
 
 def zone(osc: Oscillator, mode: Mode) -> tuple[Array, Array]:
-    """The edges between which the contacts of a mode do not change."""
+    """The two edges, lower and upper, between which the mode's contacts do not change."""
     lower, upper = jnp.asarray(-jnp.inf), jnp.asarray(jnp.inf)
     sides = zip(edges(osc), bounds_leftward(mode), bounds_rightward(mode), strict=True)
     for edge, on_left, on_right in sides:

@@ -19,9 +19,9 @@ velocity or load oscillates, stand in `forcing`. The paper's symbols, and ours:
 
 What happens where the field is not smooth is defined in `modes`.
 
-An oscillator that knows the time, see `has_clock`, has no field of (x1, x2) alone. At an instant it
-is one without a clock, with a constant force and belts of constant velocity and load: `at_time`
-gives that one, and everything that asks for forces, guards or modes at an instant takes it.
+An oscillator with a clock, see `has_clock`, has no field of (x1, x2) alone. At an instant it equals
+an oscillator without a clock, with a constant force and belts of constant velocity and load:
+`at_time` returns that one, and all code that needs forces, guards or modes at an instant takes it.
 """
 
 import functools
@@ -65,9 +65,9 @@ from .forcing import (
 )
 from .friction import AbstractFriction, as_friction
 
-#: A common period has so many periods of the slowest wave at most.
+#: Largest number of periods of the slowest wave in a common period of all waves.
 RATIOS = 64
-#: Rounding of a ratio of two frequencies.
+#: Relative rounding of a ratio of two frequencies.
 RATIO_ROUNDING = 1e-14
 
 
@@ -90,13 +90,13 @@ def as_edge(field: str) -> Callable[[Any], Array]:
 def _as_edge(value: Any, field: str) -> Array:
     """`value` as the edge of a contact interval, or a `ValueError`.
 
-    An edge at infinity has no effect on the motion, and so no slope: that of inf/L is infinite.
+    An edge at infinity has no effect on the motion, so its slope is 0; that of inf/L is infinite.
     """
     edge = as_array(value, field)
     if not isinstance(edge, Tracer):
         return edge
     try:
-        # Under derivatives alone it is known, and then known to be no edge as well.
+        # Under derivatives without `jit` the value is known: then infinity becomes a constant.
         at_infinity = next((end for end in (-np.inf, np.inf) if bool(edge == end)), None)
     except jax.errors.ConcretizationTypeError:
         return _as_it_is(edge)
@@ -106,8 +106,8 @@ def _as_edge(value: Any, field: str) -> Array:
 class NoEdge(float):
     """An edge at infinity that is part of the structure of an oscillator.
 
-    It works as a number everywhere, but is no leaf: so it is known in every trace, and code for
-    edges is left out there.
+    It works as a number everywhere, but is no leaf: so every trace knows it and leaves out the code
+    for edges.
     """
 
 
@@ -141,7 +141,7 @@ class Belt(KnownNames):
             reversed.
     """
 
-    # A scalar array, or `Oscillating`.
+    # A scalar array or an `Oscillating`.
     velocity: Any = eqx.field(converter=as_velocity, metadata=quantity("velocity"))
     friction: AbstractFriction = eqx.field(converter=as_friction)
     load: Any = eqx.field(converter=as_load, default=1.0, metadata=quantity("force"))
@@ -193,7 +193,7 @@ def number_or_wave(value: Any) -> str:
 
 
 class MovingBelt(Belt):
-    """A belt whose velocity oscillates, at an instant; rate: the derivative of its velocity."""
+    """A belt of oscillating velocity at an instant; rate: the time derivative of its velocity."""
 
     rate: Array = eqx.field(kw_only=True)
 
@@ -236,9 +236,9 @@ class Oscillator(KnownNames):
 
     def check(self) -> None:
         """Raises a `ValueError` that names the first field with an impossible known value."""
-        # Known values are converted to NumPy: reading an array of JAX's costs a hundred times more.
-        # Checks are taken from their class, as Equinox makes a module of a method of an object. A
-        # user's law may have Python's numbers, too.
+        # Known values become NumPy arrays: reading a JAX array costs a hundred times more. Checks
+        # are called through their class, as Equinox makes a module of a bound method. A user's law
+        # may have Python numbers, too.
         osc = jax.tree.map(_in_numpy, self) if is_concrete(self) else self
         for rule in Oscillator.rules(osc):
             rule.enforce("")
@@ -266,14 +266,14 @@ class Oscillator(KnownNames):
 
 
 def has_clock(osc: Oscillator) -> bool:
-    """Whether the oscillator knows the time; decided by its structure, so known in a trace, too."""
+    """Whether a force, velocity or load varies in time; known from the structure, in traces too."""
     forced = any(not isinstance(force, ConstantForce) for force in osc.forcing)
     waves = [wave for belt in osc.belts for wave in (belt.velocity, belt.load)]
     return forced or any(isinstance(wave, Oscillating) for wave in waves)
 
 
 def refuse_clock(osc: Any, name: str, instead: str = "") -> None:
-    """Raises if an oscillator knows the time and `name` is for those that do not.
+    """Raises if an oscillator has a clock but `name`, a function, takes only those without one.
 
     instead: what else to use, such as "jb.sweep(...)".
     """
@@ -284,7 +284,7 @@ def refuse_clock(osc: Any, name: str, instead: str = "") -> None:
 
 
 def check_clock(osc: Any, name: str, instead: str) -> None:
-    """Raise where an oscillator does not know the time and `name` is for those that do.
+    """Raises if an oscillator has no clock but `name`, a function, takes only those with one.
 
     instead: what else to use, such as "jb.find_cycle".
     """
@@ -294,19 +294,19 @@ def check_clock(osc: Any, name: str, instead: str) -> None:
 
 
 def waves_of(osc: Oscillator) -> list[Any]:
-    """All that knows the time: forces, then velocities and loads."""
+    """All that depends on the time: forces, then oscillating velocities and loads of the belts."""
     forces = [one for one in osc.forcing if not isinstance(one, ConstantForce)]
     waves = [wave for belt in osc.belts for wave in (belt.velocity, belt.load)]
     return forces + [wave for wave in waves if isinstance(wave, Oscillating)]
 
 
 def frequencies(osc: Oscillator) -> list[Array]:
-    """Angular frequencies of all that knows the time, as in `waves_of`."""
+    """Angular frequencies of the `waves_of` an oscillator, in the same order."""
     return [wave.frequency for wave in waves_of(osc)]
 
 
 def clock_frequency(osc: Oscillator) -> Array:
-    """Frequency by which periods are counted: of the first of `waves_of` where it is not 0."""
+    """Frequency by which periods are counted: the first of `frequencies` that is not 0."""
     return _first_not_zero(frequencies(osc))
 
 
@@ -315,16 +315,15 @@ def _first_not_zero(numbers: Sequence[Any], xp: Any = jnp) -> Any:
 
 
 def repeating(osc: Oscillator) -> list[Array]:
-    """Frequencies with which what knows the time repeats, as `rate_of_repeats`, see
-    `common_turns`."""
+    """The `rate_of_repeats` of each of the `waves_of` an oscillator; see `common_turns`."""
     return [rate_of_repeats(wave) for wave in waves_of(osc)]
 
 
 def common_turns(rates: Sequence[Any], xp: Any = jnp) -> Any:
-    """How many periods of the clock are one of all waves, by their `repeating` rates, arrays of one
-    shape, of NumPy or JAX as `xp` says; 0 where they have none in common, see `RATIOS`.
+    """Number of periods of the clock in the common period of all waves; 0 if there is none within
+    `RATIOS`. rates: the `repeating` rates, arrays of one shape, of NumPy or JAX as `xp` says.
 
-    A wave that is constant, of the rate 0, repeats always.
+    A constant wave, with the rate 0, repeats with any period.
     """
     found = [xp.abs(one) for one in rates]
     slowest = functools.reduce(xp.minimum, [xp.where(one == 0, xp.inf, one) for one in found])
@@ -340,22 +339,22 @@ def common_turns(rates: Sequence[Any], xp: Any = jnp) -> Any:
 
 
 def fastest(osc: Oscillator) -> Array:
-    """The highest frequency of all that knows the time, at least 1, the natural frequency."""
+    """The highest frequency of all that depends on the time, at least 1, the natural frequency."""
     forces = [one.fastest for one in osc.forcing if not isinstance(one, ConstantForce)]
     waves = frequencies(osc)[len(forces) :]
     return functools.reduce(jnp.maximum, map(jnp.abs, forces + waves), jnp.ones(()))
 
 
 def wave_at(wave: Any, t: Array) -> Any:
-    """A velocity or a load at the time t."""
+    """Value at the time t of a velocity or a load, constant or oscillating."""
     return wave.value(t) if isinstance(wave, Oscillating) else wave
 
 
 def at_time(osc: Oscillator, t: Array) -> Oscillator:
-    """The oscillator without a clock that it is at the time t; without a clock, itself.
+    """The oscillator without a clock that equals `osc` at the time t; `osc` if it has no clock.
 
-    Its forces are constant and its belts have the velocity and load of that time; those whose
-    velocity oscillates are `MovingBelt`s. Derivatives by t are those of the numbers.
+    Its forces are constant and its belts have the velocity and load of that time; belts whose
+    velocity oscillates become `MovingBelt`s. Derivatives by t are those of these numbers.
     """
     if not has_clock(osc):
         return osc
@@ -377,16 +376,16 @@ def _belt_at(belt: Belt, t: Array) -> Belt:
 
 
 def constant_force(osc: Oscillator) -> list[Array]:
-    """The constant forces on the mass, each; a `TypeError` for one that has a clock."""
+    """The values of the constant forces on the mass; a `TypeError` if a force has a clock."""
     if not all(isinstance(force, ConstantForce) for force in osc.forcing):
         raise TypeError("the forces of an oscillator with a clock are those of `at_time`")
     return [force.push for force in osc.forcing if isinstance(force, ConstantForce)]
 
 
 def check_oscillator(osc: Any, field: str = "osc") -> None:
-    """Raise a `ValueError` unless it is one oscillator, all its known values possible.
+    """Raises a `ValueError` unless `osc` is one oscillator whose known values are all possible.
 
-    The entries that take one ask this first; in a forked process they raise a `RuntimeError`.
+    Public functions call this first; in a forked process it raises a `RuntimeError`.
     """
     require_own_threads()
     if not isinstance(osc, Oscillator):
@@ -397,20 +396,20 @@ def check_oscillator(osc: Any, field: str = "osc") -> None:
 
 
 def its_oscillator(value: Any, verb: str = "give") -> str:
-    """What else to give where what has an oscillator, such as a `Machine`, came in place of it."""
+    """Hint, for a message, to give the oscillator of a value that has one, such as a `Machine`."""
     has = isinstance(value, eqx.Module) and "oscillator" in dir(value)
     return f"; {verb} {type(value).__name__.lower()}.oscillator" if has else ""
 
 
 def check_scalars(osc: Oscillator) -> None:
-    """Raise where a parameter is batched; then the right tool is `jax.vmap`."""
+    """Raises a `ValueError` if a parameter is batched, for which `jax.vmap` is the right tool."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(osc):
         if eqx.is_inexact_array(leaf) and (leaf.ndim > 0 or leaf.dtype != jnp.float64):
             as_array(leaf, jax.tree_util.keystr(path, simple=True, separator="."))
 
 
 def has_possible_numbers(osc: Oscillator) -> Array:
-    """Whether all parameters are what they have to be: what `check` raises for, as a number.
+    """Whether all parameters are possible: the conditions of `check`, as a boolean scalar.
 
     Under `jit` and `vmap` nothing raises: a run of an impossible oscillator is NOT_FINITE.
     """
@@ -427,7 +426,7 @@ def interval_ends(osc: Oscillator) -> list[Any]:
 def has_edges(osc: Oscillator) -> bool:
     """Whether there may be a contact edge: one is finite, or not known to be infinite.
 
-    Known inside a trace, too, where the bounds are constants: what edges need is then left out.
+    Constant bounds are known inside a trace, too; the code that edges need is then left out.
     """
     bounds = [bound for bound in interval_ends(osc) if not isinstance(bound, NoEdge)]
     return not is_concrete(bounds) or bool(np.any(np.isfinite(bounds)))

@@ -33,33 +33,33 @@ from ..dimensions import quantity as quantity
 from .forcing import Oscillating, unchecked
 from .oscillator import Belt, NoEdge, Oscillator, has_edges, scaled_edge
 
-#: Contact edges cut the motion off where a belt could pull the mass farther than this many times
-#: as far: then they and the velocities give its size, not the friction.
+#: Where a belt could pull the mass more than HEAVY times as far as the contact edges, these cut the
+#: motion off: then edges and velocities give the oscillator's size, not the friction.
 HEAVY = 64.0
 
 
 class OwnUnits(eqx.Module):
-    """The units of an oscillator: length, of x1 and x2, a power of two; velocity, of belts."""
+    """Units of an oscillator. length: of x1 and x2, a power of two; velocity: of the belts."""
 
     length: Array
     velocity: Array
 
     @property
     def is_given(self) -> bool:
-        """Whether these are known, and those of the user."""
+        """Whether both units are known to be 1, that is, the user's units."""
         return is_concrete(self) and bool(np.all([self.length, self.velocity] == np.ones(2)))
 
     def into(self, states: Any) -> Any:
-        """States (x1, x2) of the user in these units."""
+        """States (x1, x2) given in the user's units, in these units."""
         return states if self is _units_of_one() else states / self.length
 
     def back(self, value: Any, *dimensions: str) -> Any:
-        """A quantity in the units of the user; see `quantity`."""
+        """A value given in these units, in the user's units; dimensions: see `quantity`."""
         return rescaled_quantity(value, self.length, dimensions)
 
 
 class OwnOscillator(Oscillator):
-    """An oscillator in units of its own, which it knows."""
+    """An oscillator in own units; `units` convert between these and the user's."""
 
     units: OwnUnits = dataclasses.field(kw_only=True)
 
@@ -67,13 +67,13 @@ class OwnOscillator(Oscillator):
 def own_length(osc: Oscillator) -> Any:
     """The own unit of length: the size of an oscillator, rounded down to a power of two.
 
-    The size is the largest friction force over the stiffness, u0 mu(0): the mass sticks within
-    that distance of the origin. A heavy belt whose contact ends earlier moves the mass no farther
-    than to the edge; there edges and velocities determine the size, also without friction.
+    The size is the largest friction force over the stiffness, u0 mus: the mass sticks within that
+    distance of the origin. A heavy belt whose contact ends earlier moves the mass no farther than
+    to the edge; then edges and velocities determine the size. So they do without friction.
     """
 
     def number(leaf: Any) -> Any:
-        """A leaf without derivatives; in NumPy where it is known, which compiles nothing."""
+        """A leaf without derivatives; known ones as NumPy arrays, which compiles nothing."""
         return np.asarray(leaf) if is_concrete(leaf) else lax.stop_gradient(leaf)
 
     def largest(wave: Any) -> Any:
@@ -95,7 +95,7 @@ def own_length(osc: Oscillator) -> Any:
     size = force
     if edges or not is_concrete(force) or not force > 0:
         one = np if is_concrete(osc) else jnp
-        # An edge at 0 has no length, and cuts all the same.
+        # An edge at 0 gives no length, but it cuts the motion off all the same.
         cuts = [(load > 0) & one.isfinite(edge) for load, edge in edges]
         lengths = [
             one.where(cut, one.abs(edge), 0.0) for cut, (_, edge) in zip(cuts, edges, strict=True)
@@ -104,7 +104,7 @@ def own_length(osc: Oscillator) -> Any:
             one.where(load > 0, one.abs(largest(belt.velocity)) / number(osc.omega), 0.0)
             for load, belt in zip(loads, osc.belts)
         ]
-        # Known numbers are so in a trace, too.
+        # Inside a trace, known numbers must stay known.
         known = jax.ensure_compile_time_eval() if is_concrete(osc) else contextlib.nullcontext()
         with known:
             pushes = [number(force.bound(osc.damping)) for force in osc.forcing]
@@ -121,8 +121,8 @@ EXPONENT = np.int64(0x7FF0000000000000)
 
 
 def power_of_two_below(size: Any) -> Any:
-    """The largest power of two that is no larger, by the bits of its exponent; 1 for what is not
-    positive and finite."""
+    """The largest power of two <= size, by the bits of its exponent; 1 unless size is positive and
+    finite."""
     if is_concrete(size):
         size = np.asarray(size, np.float64)
         fine = bool(size > np.finfo(np.float64).tiny) and bool(np.isfinite(size))
@@ -135,8 +135,8 @@ def power_of_two_below(size: Any) -> Any:
 def in_own_units(osc: Oscillator, unit: Any = None, *, edges: bool | None = None) -> OwnOscillator:
     """The oscillator in its own units, or in those with a given unit of length.
 
-    An oscillator that is in its own units already stays as it is. edges: whether there may be
-    contact edges, see `without_edges`; None: as far as is known of this one.
+    An oscillator that is in own units already is returned as it is. edges: whether there may be
+    contact edges, see `without_edges`; None: what `has_edges` says.
     """
     if isinstance(osc, OwnOscillator):
         return osc
@@ -156,10 +156,10 @@ def in_own_units(osc: Oscillator, unit: Any = None, *, edges: bool | None = None
 
 
 def in_units_of_run(osc: Oscillator, *, edges: bool | None = None) -> OwnOscillator:
-    """The oscillator as a run of the kernel takes it: in own units, which lead back to those given.
+    """The oscillator in own units, for a run whose results go back to the units of `osc`.
 
-    An oscillator that comes in its own units gets its results in these. edges: as in
-    `in_own_units`.
+    An oscillator that is in own units already gets its results in these: it is returned with units
+    of 1. edges: as in `in_own_units`.
     """
     own = in_own_units(osc, edges=edges)
     if own is not osc:
@@ -168,12 +168,12 @@ def in_units_of_run(osc: Oscillator, *, edges: bool | None = None) -> OwnOscilla
 
 
 AnyOscillator = TypeVar("AnyOscillator", bound=Oscillator)
-#: The bounds of a belt that touches the mass everywhere, with and without leaves.
+#: The bounds, which are no leaves, of a belt that touches the mass everywhere.
 NO_EDGES = dict(lower=NoEdge("-inf"), upper=NoEdge("inf"))
 
 
 def without_edges(osc: AnyOscillator) -> AnyOscillator:
-    """The oscillator whose belts touch the mass everywhere, known in every trace, see `NoEdge`."""
+    """The oscillator with belts that touch the mass everywhere, known so in every trace."""
     if all(isinstance(belt.lower, NoEdge) for belt in osc.belts):
         return osc
     belts = tuple(unchecked(type(belt), **vars(belt) | NO_EDGES) for belt in osc.belts)
@@ -181,7 +181,7 @@ def without_edges(osc: AnyOscillator) -> AnyOscillator:
 
 
 def _with_leaves(belts: tuple[Belt, ...]) -> tuple[Belt, ...]:
-    """Belts of which every bound is an array, as their user has them."""
+    """Belts with an array for every bound, as in the user's oscillator."""
     if not any(isinstance(belt.lower, NoEdge) for belt in belts):
         return belts
     with jax.ensure_compile_time_eval():
@@ -199,12 +199,12 @@ def _known_units(length: Any, velocity: Any) -> OwnUnits:
 
 @functools.cache
 def _units_of_one() -> OwnUnits:
-    """Made once, as to put a number into JAX takes as long as all else."""
+    """Units of 1; made once, because making a JAX array takes as long as all the rest."""
     return _known_units(1.0, 1.0)
 
 
 def in_units(value: Any, unit: Any, default: float) -> Any:
-    """A size in own units, which is given in the user's, or NaN where the default holds."""
+    """A size in own units: `value`, given in the user's, or `default` where it is NaN."""
     return jnp.where(jnp.isnan(value), default, value / unit)
 
 
@@ -223,7 +223,7 @@ def _scaled(belts: tuple[Belt, ...], units: OwnUnits) -> tuple[Belt, ...]:
 
 
 def in_unit(wave: Any, unit: Any, time: Any = 1.0) -> Any:
-    """A velocity or a load in a unit of its own, and in one of time."""
+    """A velocity or a load in the given units of its value and, if it oscillates, of time."""
     return wave.in_units_of(unit, time) if isinstance(wave, Oscillating) else wave / unit
 
 
@@ -235,16 +235,16 @@ def _scaled_forces(forcing: tuple[Any, ...], units: OwnUnits) -> tuple[Any, ...]
 
 
 def in_given_units(result: Any, osc: Oscillator, own: OwnOscillator) -> Any:
-    """A result that was found for an oscillator in own units, in those of the oscillator given."""
+    """A result found for `own`, in the units of `osc`, which replaces the oscillators in it."""
     return result if own is osc else rescaled(result, own.units.length, lambda _: osc)
 
 
 def rescaled(
     result: Any, length: Any, oscillator: Callable[[Oscillator], Oscillator] | None = None
 ) -> Any:
-    """A result whose lengths are multiplied by a number, and whose oscillators are replaced.
+    """A result with its lengths multiplied by a number, and its oscillators replaced.
 
-    oscillator: what to put in the place of one; None: those in own units as their user has them.
+    oscillator: function that gives the replacement; None: `in_units_of_user`.
     """
     put = in_units_of_user if oscillator is None else oscillator
     is_one = _is_one(length)
@@ -274,7 +274,7 @@ def rescaled(
 
 @functools.cache
 def _fields_of(kind: type) -> list[tuple[str, tuple[str, ...] | None]]:
-    """The names of the fields of a module, and the dimensions of those that have any."""
+    """Names of a module's fields, each with the dimensions of the field, or None."""
     return [(one.name, one.metadata.get("dimensions")) for one in dataclasses.fields(kind)]
 
 
@@ -285,7 +285,7 @@ def _is_one(length: Any) -> bool:
 
 
 def rescaled_quantity(value: Any, length: Any, dimensions: tuple[str, ...]) -> Any:
-    """A quantity of known dimensions in a unit of length that is 1/length of the one before."""
+    """A quantity with these dimensions when the numbers of lengths are multiplied by `length`."""
     powers = [POWERS[name] for name in dimensions]
     if value is None or _is_one(length) or not any(powers):
         return value
@@ -299,7 +299,7 @@ def rescaled_quantity(value: Any, length: Any, dimensions: tuple[str, ...]) -> A
 
 
 def in_units_of_user(own: Oscillator) -> Oscillator:
-    """An oscillator as the user has it, but for rounding where omega is no power of two."""
+    """The oscillator in the user's units, up to rounding if omega is no power of two."""
     if not isinstance(own, OwnOscillator):
         return own
     units = own.units

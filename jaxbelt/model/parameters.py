@@ -2,8 +2,8 @@
 
 Two parameters may have one value, and two belts may share one friction law; parameters
 differ in their place among the leaves of the oscillator, as JAX counts them. So `where` is called
-on a copy of the oscillator whose leaves are unique objects: its result is one of them, or it is not
-a parameter.
+on a copy of the oscillator whose leaves are unique objects: if its result is none of these, it has
+not selected a parameter.
 
 The fields of an oscillator state the dimensions of its parameters; the unit of a number of a
 friction law follows from its `in_units_of`.
@@ -23,12 +23,12 @@ from .friction import LawInUnits
 from .machine import SI_UNITS, Units
 from .oscillator import Oscillator
 
-#: Relative accuracy to which a number of a friction law has to follow a power of the unit of speed.
+#: Relative accuracy with which a number of a law must scale as a power of the unit of speed.
 POWER_ROUNDING = 1e-12
 
 
 class Parameter:
-    """Stands for a leaf where `where` is asked. It has no value, so nothing is computed with it."""
+    """Placeholder of a leaf while `where` selects; without a value, so nothing computes with it."""
 
     def __init__(self, index: int, name: str):
         self.index, self.name = index, name
@@ -52,8 +52,8 @@ def names_of(osc: Any) -> list[str]:
 def leaf_index(osc: Oscillator, where: Any) -> int:
     """The number of the parameter that `where` selects, among the leaves of the oscillator.
 
-    By its number, not by the function: a new lambda in every call would compile anew every time.
-    `ValueError` where that is no parameter.
+    Programs depend on the number, not on the function: a new lambda in every call would compile
+    anew every time. `ValueError` if `where` does not select a parameter.
     """
     expected = (
         f"a function that selects one parameter{_of(osc)}, unchanged, such as "
@@ -67,8 +67,8 @@ def leaf_index(osc: Oscillator, where: Any) -> int:
 def leaf_groups(osc: Oscillator, where: Any) -> tuple[tuple[int, ...], ...]:
     """The numbers of the leaves of each parameter that `where` selects, as for `fit`.
 
-    It gives a leaf, or a tuple with an entry for each parameter: a leaf, or a tuple of leaves that
-    are to be equal. `ValueError` for anything else, and for a leaf that comes twice.
+    `where` returns a leaf, or a tuple with an entry for each parameter: a leaf, or a tuple of
+    leaves that are to be equal. `ValueError` for anything else, and for a leaf that comes twice.
     """
     expected = (
         f"a function that selects parameters{_of(osc)}, unchanged: one, or a tuple, each entry a "
@@ -85,7 +85,7 @@ def leaf_groups(osc: Oscillator, where: Any) -> tuple[tuple[int, ...], ...]:
 
 
 def _ask(osc: Oscillator, where: Any, expected: str) -> Any:
-    """What `where` selects of a copy whose leaves are `Parameter`s."""
+    """What `where` returns for a copy of the oscillator whose leaves are `Parameter`s."""
     require_callable(where, "where", expected)
     leaves = [Parameter(index, name) for index, name in enumerate(names_of(osc))]
     try:
@@ -104,12 +104,12 @@ def _is_parameter(osc: Oscillator, chosen: Any) -> bool:
 
 
 def is_number(leaf: Any) -> bool:
-    """Whether it is one number, which may be varied."""
+    """Whether a leaf is a single number, which may be varied."""
     return (is_real(leaf) or type(leaf) is int) and np.ndim(leaf) == 0
 
 
 def is_real(leaf: Any) -> bool:
-    """Whether it is a float, or an array of them. Of a law of the user's own it may be anything."""
+    """Whether a leaf is a float or an array of floats; a leaf of a user's law may be anything."""
     dtype = getattr(leaf, "dtype", None)
     return type(leaf) is float if dtype is None else bool(jnp.issubdtype(dtype, jnp.floating))
 
@@ -124,7 +124,7 @@ def _tuple(chosen: Any) -> tuple[Any, ...]:
 
 
 def _told(chosen: Any) -> str:
-    """What came, in words; numbers are not known here, so modules do not print."""
+    """What `where` returned, in words; a module of leaves without values cannot print itself."""
     if isinstance(chosen, tuple | list):
         return f"({', '.join(map(_told, chosen))})"
     if isinstance(chosen, eqx.Module):
@@ -133,9 +133,9 @@ def _told(chosen: Any) -> str:
 
 
 def vary(osc: Oscillator, index: int, p: Array) -> Oscillator:
-    """The oscillator with the parameter of that number replaced by p, [1]."""
+    """The oscillator with the leaf of this number replaced by p, [1]."""
     leaves, structure = jax.tree.flatten(osc)
-    # What is known is taken apart in NumPy, which compiles nothing.
+    # A known array is taken apart by NumPy, which compiles nothing.
     leaves[index] = jnp.asarray(np.asarray(p)[0]) if is_concrete(p) else p[0]
     return jax.tree.unflatten(structure, leaves)
 
@@ -144,10 +144,10 @@ def vary(osc: Oscillator, index: int, p: Array) -> Oscillator:
 
 
 def unit_of(name: str, osc: Oscillator, units: Units) -> tuple[str, float]:
-    """Unit of a parameter of an oscillator, and the value of 1 in it.
+    """SI unit of a parameter of an oscillator, and the size of the oscillator's unit in it.
 
-    Tied parameters, "damping = belts[0].load", must have the same. "" and 1 where only the author
-    of a force or a law knows it.
+    Tied parameters, "damping = belts[0].load", must have the same unit. "" and 1 where only the
+    author of a force or a law knows it.
     """
     found = set()
     for path in name.split(" = "):
@@ -163,7 +163,7 @@ def unit_of(name: str, osc: Oscillator, units: Units) -> tuple[str, float]:
 
 
 def _dimension_of(path: str, osc: Oscillator) -> str | None:
-    """Dimension of a number, of its field or of the field that holds it; None: not stated."""
+    """Dimension stated by the field of a number, or by a field around it; None: not stated."""
     owner: Any = osc
     dimension = None
     for step in re.findall(r"\w+", path):
@@ -177,7 +177,7 @@ def _dimension_of(path: str, osc: Oscillator) -> str | None:
 
 
 def _unit_in_law(path: str, osc: Oscillator, units: Units) -> tuple[str, float]:
-    """Unit of a number of a friction law, and the value of 1 in it.
+    """SI unit of a number of a friction law, and the size of the oscillator's unit in it.
 
     It follows from how the number changes when speeds are given in another unit; "" and 1 where the
     law takes speeds in a unit that only its author knows.

@@ -16,12 +16,12 @@ from .oscillator import Oscillator
 
 #: Speed at the edge above which no orbit counts as captured by a stable pseudo-focus there.
 FOCUS_RADIUS = 1e-2
-#: That speed over the larger one of the edge and the belts' velocities: a heavy belt makes the own
-#: unit larger than the motion.
+#: The same limit relative to the largest of |edge| and the speeds of touching belts: a heavy belt
+#: makes the own unit of length larger than the motion.
 FOCUS_SHARE = 4 * FOCUS_RADIUS
-#: Speed at the edge below which loops around it, as wide as its square, are rounding of x1.
+#: Speed at the edge below which loops around it, about speed^2 wide, are rounding of x1.
 FOCUS_ROUNDING = 1e-7
-#: A loop is short where it takes less than this beside 1 / frequency of a force.
+#: A loop is short if it takes less than this times 1 / (highest frequency of the forces).
 SHORT_LOOP = 0.1
 
 
@@ -87,10 +87,10 @@ def _edge_focus(*sides: tuple[Array, ...]) -> EdgeFocus:
 
 
 class ForceRange(eqx.Module):
-    """Forces that know the time, beside an oscillator at an instant.
+    """Forces that depend on the time, relative to the oscillator of an instant.
 
-    least, most: what they may add to the acceleration at that instant, at all times; frequency: the
-    highest one of them.
+    least, most: bounds of what they add, at all times, to the acceleration at that instant;
+    frequency: the highest one of the forces.
     """
 
     least: Array
@@ -109,13 +109,13 @@ def is_captured(
     """Whether an orbit that crosses the edge with velocity x2 is captured by a pseudo-focus there.
 
     The leading term of a loop must outweigh the next one by ten (see `EdgeFocus`), and no boundary
-    may be near, and no other edge; edges that are one up to rounding are passed together. With a
-    belt at rest, or with a fixed point on the edge, the loops shrink to rounding.
+    and no other edge may be near; edges that are equal up to rounding are passed together. Where a
+    belt at rest touches, or a fixed point is on the edge, the loops must have shrunk to rounding.
 
     With forces all this must hold for the least and for the largest one. The sign of the rate is
-    that of a function linear in the force, so it holds between them. Loops are short beside a
-    period of the forces; then v^3 (1/a_L + 1/|a_R|) changes by the rate alone, and the
-    velocity v may grow as the force goes round by the cube root of how much that sum varies.
+    that of a function linear in the force, so it holds between them. Loops must be short beside a
+    period of the forces; then v^3 (1/a_L + 1/|a_R|) changes by the rate alone, and while the force
+    goes round, the velocity v may grow by the cube root of how much 1/a_L + 1/|a_R| varies.
     """
     left = _past_all(osc, left, edge, x2)
     right = _past_all(osc, right, edge, x2, rightward=True)
@@ -152,8 +152,8 @@ def _is_captured(
     sides: tuple[tuple[Array, ...], ...],
     speeds: tuple[Array, Array, Array],
 ) -> Array:
-    """`is_captured` with the fields on both sides; speeds: of the mass, and the least and the
-    largest one of belts and edge."""
+    """`is_captured` from the Taylor coefficients of the fields on both sides; speeds: that of the
+    mass, the least one of touching belts, and the largest of these and |edge|."""
     (on_left, on_right), (size, nearest, largest) = sides, speeds
     focus = _edge_focus(on_left, on_right)
     captured = (
@@ -175,8 +175,8 @@ def _is_captured(
 def _past_all(
     osc: Oscillator, mode: Mode, edge: Array, x2: Array, *, rightward: bool = False
 ) -> Mode:
-    """A slow mode beside an edge on the outer side of all edges that are one with it up to
-    rounding."""
+    """The mode of a slow mass that is beside an edge, and beyond all edges that are equal to it up
+    to rounding."""
     rounding, codes = force_rounding(edge), []
     for belt, code in zip(osc.belts, mode.codes, strict=True):
         at_lower, at_upper = (jnp.abs(x - edge) <= rounding for x in (belt.lower, belt.upper))
@@ -188,10 +188,10 @@ def _past_all(
 
 
 def _is_alone(osc: Oscillator, edge: Array, to_left: Array, to_right: Array) -> Array:
-    """Whether no other edge of a belt with a load is so near to one: what attracts where an orbit
-    passes one edge may repel where it passes both.
+    """Whether no other edge of a belt with a load is near: a focus that attracts orbits that pass
+    one edge may repel those that pass both.
 
-    A loop reaches half as far as size^2 over the push towards the edge.
+    to_left, to_right: size^2 over the push towards the edge; a loop reaches half as far.
     """
     alone = jnp.asarray(True)
     for belt in osc.belts:

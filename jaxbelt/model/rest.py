@@ -1,4 +1,4 @@
-"""Orbits that come to rest: which states are at rest, or nearly, and which will be."""
+"""Coming to rest: which states are at rest, or nearly, and which are sure to come to rest."""
 
 import functools
 from collections.abc import Sequence
@@ -22,14 +22,14 @@ from .modes import (
 from .oscillator import Belt, Oscillator
 from .transitions import at_focus
 
-#: Radius of the smallest disc that is checked: in smaller ones the rounding of x1 counts.
+#: Radius of the smallest disc that is checked: on smaller ones rounding of x1 would decide.
 SMALLEST_DISC = 1e-6
 #: Speeds, as fractions of the radius, at which an attracting disc is checked.
 DISC = tuple(sign * j / 8 for j in range(1, 9) for sign in (1, -1))
 
 
-#: Below this speed and force derivatives are taken at a fixed time: the time at which such a slow
-#: state passes a place is good to some 1e-16 over its speed, here 1e-12.
+#: Where speed and x2' are below this, derivatives are taken at a fixed time: the time at which such
+#: a slow state passes a place is accurate to some 1e-16 over its speed only, here 1e-12.
 SLOW_MOTION = 1e-4
 
 
@@ -42,22 +42,22 @@ def is_slow(x2: Array, a: Array) -> Array:
     """Whether a state moves so slowly that its derivatives are better taken at a fixed time.
 
     Where x2 and x2' = a vanish, the time at which it passes a place has derivatives without bounds.
-    Faster states keep those of their events' times, by which all that no longer depends on the
-    start has derivatives that are exactly 0.
+    Faster states keep the derivatives of the times of their events, so that results that no longer
+    depend on the start have derivatives that are exactly 0.
     """
     return jnp.maximum(jnp.abs(x2), jnp.abs(a)) < SLOW_MOTION
 
 
 def start_at_focus(osc: Oscillator, x1: Array, x2: Array) -> tuple[Array, Array]:
-    """The start (x1, x2); its derivatives at a pseudo-focus are those of the edge that this is on.
+    """The start (x1, x2); at a pseudo-focus its derivatives are those of the edge it lies on.
 
-    Neighbours of such a start are soon back there, or never.
+    Orbits that start beside a pseudo-focus are soon back there, or never.
     """
     if not has_edges(osc):
         return x1, x2
     edge = foremost(osc, [x1 == edge for edge in edges(osc)], edges(osc), x1)
     there = at_focus(osc, x1, x2)
-    # The numbers are the same: XLA never ends to simplify a choice between them.
+    # Not a choice between edge and x1, which are equal there: XLA never ends simplifying it.
     fixed1, fixed2 = lax.stop_gradient((x1, x2))
     slope = edge - lax.stop_gradient(edge)
     return jnp.where(there, fixed1 + slope, x1), jnp.where(there, fixed2, x2)
@@ -66,16 +66,17 @@ def start_at_focus(osc: Oscillator, x1: Array, x2: Array) -> tuple[Array, Array]
 def settling_margin(
     osc: Oscillator, mode: Mode, x1: Array, x2: Array
 ) -> tuple[Array, Array, Array]:
-    """Positive where an orbit of a slip mode has entered a disc that its fixed point attracts, or
-    is there up to rounding: a node on an edge, or on the boundary of a belt at rest, has no disc.
+    """Margin and x1 of a slip mode's fixed point, and whether an orbit stands at a repelling one.
 
-    And that fixed point's x1; and whether the orbit stands there up to rounding though everything
-    near it is repelled, as where slip begins on a belt that creeps: where it goes is not known.
+    The margin is positive where the orbit has entered a disc that the fixed point attracts, or is
+    at the fixed point up to rounding: a node on an edge, or on the boundary of a belt at rest, has
+    no disc. A fixed point repels where slip begins on a belt that creeps, say; an orbit that stands
+    there up to rounding may go anywhere.
 
     In a slip mode x1'' = -(x1 - x1_rest) + f(x2) with f(0) = 0, so E = (x1 - x1_rest)^2 + x2^2
     obeys E' = 2 x2 f(x2). If v f(v) < 0 for all 0 < |v| <= radius, and the disc lies within the
     mode's boundaries and edges, E falls until the orbit is at rest. The sign is checked at 16
-    speeds; a law that wiggles on a scale below radius/8 could deceive that.
+    speeds; a law that wiggles on a scale below radius/8 could deceive this check.
     """
     zero = jnp.zeros_like(x1)
     x1_rest = mode_acceleration(osc, mode, zero, zero)
@@ -93,20 +94,20 @@ def settles(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
     return ~mode.any_stuck & (settling_margin(osc, mode, x1, x2)[0] > 0)
 
 
-#: So much of the range of speeds, and of the time, may a loop touch or stick to a belt by the
-#: error of an integrated orbit: that of the largest circle, which is tangent to the boundary.
+#: Shares of the range of speeds by which a loop may pass a belt's boundary, and of the time that it
+#: may stick, by integration errors alone: the largest circle is tangent to the boundary.
 TOUCH_SHARE, STICK_SHARE = 1e-6, 1e-3
 
 
 def is_neutral(
     osc: Oscillator, x1: tuple[Array, Array], x2: tuple[Array, Array], stuck: Array
 ) -> Array:
-    """Whether a closed orbit is one of a continuum of such.
+    """Whether a closed orbit is one of a continuum of closed orbits.
 
-    It is where the force of each belt that no speed of the loop reaches is even in x2, and so the
-    sum of damping and of the belts that always touch, see `_is_balanced`: then time reversed maps
-    (x1, x2) to (x1, -x2), and every such orbit closes. x1, x2: the smallest and the largest of the
-    loop; stuck: how much of the time it sticks.
+    It is one if it passes no belt's boundary and these forces are even in x2, see `_is_balanced`:
+    that of each belt that touches only a part of the loop, and the sum of damping and of the belts
+    that always touch. Then time reversed maps (x1, x2) to (x1, -x2), and every such orbit closes.
+    x1, x2: the smallest and the largest on the loop; stuck: the share of the time that it sticks.
     """
     zero = jnp.zeros_like(x2[0])
     neutral = stuck < STICK_SHARE
@@ -122,7 +123,7 @@ def is_neutral(
         sign = jnp.sign(belt.velocity - 0.5 * osc.omega * (x2[0] + x2[1]))
         r = [sign * (belt.velocity - osc.omega * v) for v in x2]
         reached = jnp.minimum(*r) < -slack
-        # Where a static limit beyond mu(0) holds the mass for a while it is a cycle of its own.
+        # A loop that a static limit beyond mu(0) holds for a while is an isolated cycle.
         holds = belt.load * (belt.friction.static - belt.friction.mu(zero)) > 0
         neutral = neutral & ~(touches & holds & (stuck > 0))
         undamped = eqx.tree_at(lambda o: o.damping, osc, zero)
@@ -136,7 +137,7 @@ def is_centre(osc: Oscillator, mode: Mode) -> Array:
     """Whether orbits around rest in a slip mode are closed: all its forces together are even in x2
     up to the speed of the slowest belt that touches, see `is_neutral`.
 
-    Where they are nearly, up to their own rounding, they are taken to be.
+    Forces that are even in x2 up to their own rounding count as even.
     """
     slowest = jnp.inf
     signs = []
@@ -145,7 +146,7 @@ def is_centre(osc: Oscillator, mode: Mode) -> Array:
         signs.append((belt, jnp.where(pulls, code, 0.0)))
         speed = jnp.abs(belt.velocity) / osc.omega
         slowest = jnp.minimum(slowest, jnp.where(pulls, speed, jnp.inf))
-    # At the speed of a belt that does not move nothing is balanced.
+    # If a belt at rest touches, the range of speeds is empty: no centre.
     fastest = jnp.where(jnp.isinf(slowest), 1.0, slowest)
     return (fastest > 0) & _is_balanced(osc, signs, fastest, None)
 
@@ -155,8 +156,8 @@ def _is_balanced(
 ) -> Array:
     """Whether damping and belts, with their signs of r (0: none), pull alike at x2 and -x2.
 
-    Looked at up to the speed `fastest`. error: how much counts as equal; None: the rounding of
-    those forces that are not even by themselves.
+    Checked up to the speed `fastest`. error: difference that counts as 0; None: the rounding of the
+    forces that are not exactly even.
     """
     balanced = jnp.ones_like(fastest, dtype=bool)
     for j in range(1, 5):

@@ -1,8 +1,8 @@
 """Transitions: how an orbit goes on where a guard of its mode vanishes, and from a start.
 
-An orbit leaves a mode where one of its guards, positive inside, vanishes. What follows is decided
-by `leave_slip` and `leave_stick`, and both leave the question "stuck or not" to `modes.settle`:
-whether the contacts that are to be stuck can hold the force needed.
+An orbit leaves a mode where one of its guards, positive inside, vanishes. `leave_slip` and
+`leave_stick` decide what follows; both leave the question "stuck or not", whether the contacts that
+are to be stuck can hold the force needed, to `modes.settle`.
 """
 
 import functools
@@ -61,8 +61,8 @@ def directions(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> tuple[Array
 def guard_passed(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
     """The number of the guard through which an orbit leaves a slip mode at (x1, x2), or -1.
 
-    The guard has to vanish there, and to fall: one that vanishes and rises bounds what the orbit
-    has just entered. Numbered as in `leave_slip`; of several the first.
+    The guard has to vanish there, and to fall: one that vanishes and rises bounds the mode that it
+    has just entered. Numbered as in `leave_slip`; of several guards the first.
     """
     a_sign, v_sign = directions(osc, mode, x1, x2)
     guards = boundary_guards(osc, mode, x2)
@@ -81,8 +81,8 @@ def guard_passed(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
 
 
 def held_at_boundary(osc: Oscillator, mode: Mode, hit: Sequence[Array]) -> tuple[Mode, Array]:
-    """The mode in which a mass at r_k = 0 of the belt with hit[k] set is held by all belts that
-    touch it and have that velocity, and x2 = nu_k/omega."""
+    """The mode in which a mass at r_k = 0, of the belt k with hit[k] set, is held by all touching
+    belts of the velocity nu_k, and x2 = nu_k/omega."""
     velocities = [belt.velocity for belt in osc.belts]
     velocity = first_of(hit, velocities, velocities[0])
     held = _held_by(osc, mode, velocity)
@@ -105,7 +105,7 @@ def pass_edge(osc: Oscillator, mode: Mode, edge: Array, x2: Array, rightward: Ar
     belt that it was stuck to is left, slip on.
     """
     speed = stick_velocity(osc, mode, osc.omega * x2)
-    # Slip may have set in just before; a belt of that very velocity that arrives asks anew.
+    # Slip may have set in just before; an arriving belt of the same velocity may hold the mass.
     after = codes_past_edge(osc, mode, edge, speed, rightward)
     velocity = stick_velocity(osc, after, jnp.full_like(edge, jnp.nan))
     return settle(osc, _held_by(osc, after, velocity), edge, x2)
@@ -114,8 +114,8 @@ def pass_edge(osc: Oscillator, mode: Mode, edge: Array, x2: Array, rightward: Ar
 def codes_past_edge(
     osc: Oscillator, mode: Mode, edge: Array, speed: Array, rightward: Array
 ) -> Mode:
-    """The contact codes beyond an edge that the mass passes at omega x2 = speed, before it is asked
-    which belts hold it."""
+    """The contact codes beyond an edge that the mass passes at omega x2 = speed; an arriving belt
+    with r = 0 is stuck, and whether it holds the mass is left to the caller."""
     codes = []
     for belt, code, touches in zip(osc.belts, mode.codes, mode.touching, strict=True):
         at_lower, at_upper = belt.lower == edge, belt.upper == edge
@@ -127,10 +127,10 @@ def codes_past_edge(
 
 
 def acting_edge(osc: Oscillator, mode: Mode, flags: Sequence[Array], default: Array) -> Array:
-    """The place of those of `edges` whose flag is set, which are at one place.
+    """x1 of the `edges` whose flag is set, which are all at one place.
 
-    Its derivatives are those of the edge of the belt that the mass is stuck to, where that is one
-    of them, for there it slips on; else see `foremost`.
+    Its derivatives are those of the edge of the belt that the mass is stuck to, if this edge is
+    among them, for the mass slips on from there; else those of `foremost`.
     """
     own = [flag & stuck for flag, stuck in zip(flags, (*mode.stuck, *mode.stuck), strict=True)]
     leaves = any_of(own)
@@ -139,7 +139,7 @@ def acting_edge(osc: Oscillator, mode: Mode, flags: Sequence[Array], default: Ar
 
 
 def edge_of_guard(osc: Oscillator, mode: Mode, guard: Array) -> Array:
-    """The place of the edge whose guard has that number, see `leave_slip`; 0 of other guards."""
+    """x1 of the edge whose guard has this number, see `leave_slip`; 0 for other guards."""
     none = jnp.zeros(())
     if not has_edges(osc):
         return none
@@ -150,7 +150,7 @@ def edge_of_guard(osc: Oscillator, mode: Mode, guard: Array) -> Array:
 
 
 def is_passed_rightward(mode: Mode, guard: Array) -> Array:
-    """Whether the edge whose guard has that number is passed to the right; not of other guards."""
+    """Whether the edge whose guard has this number is passed rightward; False for other guards."""
     first = len(mode.codes)
     flags = enumerate(bounds_rightward(mode), first)
     return any_of([(guard == number) & right for number, right in flags])
@@ -160,11 +160,11 @@ def is_passed_rightward(mode: Mode, guard: Array) -> Array:
 def late_contacts(
     osc: Oscillator, mode: Mode, edge: Array, x2: Array, rightward: Array | bool
 ) -> Array:
-    """0: what x2 gains in slip because other edges at the same place are passed a little sooner or
-    later than this one, which moves by itself.
+    """0, but with derivatives: the change of x2 in slip when edges at the same place move apart, so
+    that the mass passes the others a little sooner or later than this one.
 
-    Its derivatives are not 0. A belt whose contact changes x2' by a does so (its edge - edge) / x2
-    later, and what it does then adds up with what the others do.
+    A belt whose contact changes x2' by a does so (its edge - edge) / x2 later; the changes of x2
+    by several belts add up.
     """
     return jnp.zeros_like(x2)
 
@@ -199,10 +199,10 @@ def _slip_sign(velocity: Array, speed: Array) -> Array:
 class StickPhase(eqx.Module):
     """A stick phase in closed form, from its entry to its end (arrays of the batch shape).
 
-    duration: inf where it never ends (a belt at rest); x1: where it ends; x2: of the mass in all of
-    it, which moves with the belt (a start that sticks has the same number, but not its
-    derivatives); slips: it ends by slip onset; edge: which of `edges` ends it otherwise, one flag
-    each.
+    duration: inf where it never ends (a belt at rest); x1: where it ends; x2: velocity of the mass,
+    that of the belt (a start that sticks has the same number, but not its derivatives); slips:
+    whether it ends by slip onset; edge: flags, one for each of `edges`, of those that end it
+    otherwise.
     """
 
     duration: Array
@@ -223,16 +223,16 @@ def onset_position(osc: Oscillator, mode: Mode) -> Array:
 def stick_limit(osc: Oscillator, mode: Mode, side: Array) -> Array:
     """x1 where the needed force is as large as the stuck belts of the mode can hold.
 
-    side: 1 the end on the right of where the mass sticks, -1 that on the left.
+    side: 1 for the right end of the positions at which the mass sticks, -1 for the left end.
     """
     v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
     return mode_acceleration(osc, mode, jnp.zeros(()), v) + side * capacity(osc, mode)
 
 
 def stick_phase(osc: Oscillator, mode: Mode, x1: Array) -> StickPhase:
-    """How the stick phase of `mode` that is at x1 goes on: x1 moves with x2 = nu_k/omega.
+    """The rest of a stick phase of `mode` from x1 on, where x1 moves with x2 = nu_k/omega.
 
-    It ends at slip onset or at the first contact edge ahead. Where both are at one place but for
+    It ends at slip onset or at the first contact edge ahead. If both are at one place up to
     rounding it ends at the edge, and `pass_edge` decides whether the mass sticks beyond.
     """
     v = stick_velocity(osc, mode, jnp.zeros(())) / osc.omega
@@ -252,7 +252,7 @@ def stick_phase(osc: Oscillator, mode: Mode, x1: Array) -> StickPhase:
         x1_end = jnp.where(slips, x1_onset, acting_edge(osc, mode, at_edge, x1))
     # Not distance/|v|: x1_end does not depend on x1, and so neither do its derivatives.
     duration = (x1_end - x1) / v_or_one
-    # Negative by rounding only; its derivatives are those of the quotient there, too.
+    # A negative duration is rounding; its derivatives are those of the quotient there, too.
     duration = duration + lax.stop_gradient(jnp.maximum(duration, 0.0) - duration)
     duration = jnp.where(moves, duration, jnp.inf)
     return StickPhase(duration, x1_end, v, slips, at_edge)
@@ -277,8 +277,8 @@ def leave_stick(osc: Oscillator, mode: Mode, phase: StickPhase) -> Mode:
 class Departure(eqx.Module):
     """How an orbit goes on after a guard of its slip mode vanished (arrays of the batch shape).
 
-    mode, x1, x2: from there on, x2 = nu/omega (x1 = edge) put exactly on a boundary (an edge);
-    captured: by a pseudo-focus at the edge, see `is_captured`.
+    mode, x1, x2: mode and state from there on, put exactly on a boundary (x2 = nu/omega) or an edge
+    (x1 = edge); captured: whether by a pseudo-focus at the edge, see `is_captured`.
     """
 
     mode: Mode
@@ -290,10 +290,11 @@ class Departure(eqx.Module):
 
 
 class _Guard(NamedTuple):
-    """Where a guard of a slip mode vanishes: on a boundary, or at an edge, there (x1, x2) is put.
+    """Where a guard of a slip mode vanishes: on a boundary or at an edge, with (x1, x2) put on it.
 
-    held: the mode in which belts hold the mass on the boundary; on_end: whether at their limit they
-    do not, at an edge, see `_released_at_edge`; rightward: whether the edge is passed to the right.
+    held: the mode in which belts hold the mass on the boundary; on_end: whether they let it go at
+    once, at the edge `end`, see `_released_at_edge`; rightward: whether the edge is passed to the
+    right.
     """
 
     at_boundary: Array
@@ -326,20 +327,20 @@ def _guard_of(osc: Oscillator, mode: Mode, guard: Array, x1: Array, x2: Array) -
 
 
 def on_guard(osc: Oscillator, mode: Mode, guard: Array, x1: Array, x2: Array):
-    """(x1, x2) put exactly on the boundary or the edge, see `leave_slip`."""
+    """(x1, x2) put exactly on the boundary or the edge of a guard, see `leave_slip`."""
     found = _guard_of(osc, mode, guard, x1, x2)
     return found.x1, found.x2
 
 
 def leave_slip(osc: Oscillator, mode: Mode, guard: Array, x1: Array, x2: Array) -> Departure:
-    """What follows where the guard of that number of a slip mode vanishes at (x1, x2).
+    """How an orbit goes on where the guard of this number of a slip mode vanishes at (x1, x2).
 
     The n `boundary_guards` come first, then the 2n `edge_guards`; any other number is no
     transition.
     """
     at = _guard_of(osc, mode, guard, x1, x2)
-    # Few lanes are at an event at a time, and fewer at one of a kind. Modes are piecewise constant,
-    # so they have no derivatives.
+    # `where_any`: few lanes are at an event at a time, and fewer at one of a kind. Modes are
+    # piecewise constant, so they have no derivatives.
     still, place, mode, v = lax.stop_gradient((osc, at, mode, x2))
 
     def from_boundary():
@@ -377,9 +378,11 @@ def leave_slip(osc: Oscillator, mode: Mode, guard: Array, x1: Array, x2: Array) 
 
 
 def _released_at_edge(osc: Oscillator, held: Mode, x1: Array, x2: Array) -> tuple[Array, Array]:
-    """Whether a mass that comes to rest on belts at rest does so up to rounding at their limit and
-    at the edge towards which it is pulled: beyond the edge they hold nothing, so the segment that
-    they hold has no length, and the mass goes on as from a start there. And that edge.
+    """Whether belts at rest, on which a mass comes to rest, are at their limit and at the edge to
+    which the mass is pulled, both up to rounding; and that edge.
+
+    Beyond the edge they hold nothing, so the segment that they hold has no length, and the mass
+    goes on as from a start there.
     """
     needed = mode_acceleration(osc, held, x1, x2)
     limit = capacity(osc, held)
@@ -397,8 +400,8 @@ def mode_of_state(osc: Oscillator, x1: Array, x2: Array) -> Mode:
     """The mode in which an orbit goes on from the state (x1, x2), on a boundary or an edge too.
 
     On an edge the velocity decides which side; at rest there, the acceleration on the right-hand
-    side does: the mass goes right if that is positive, else left. Where the left-hand side pushes
-    it back it stays: on the right if it can rest there, else at a pseudo-focus, see `at_focus`.
+    side does: the mass goes right if that is positive, else left. If the left-hand side pushes it
+    back it stays: on the right if it can rest there, else at a pseudo-focus, see `at_focus`.
     """
     right, left = _sides(osc, x1, x2)
     a_right, a_left = (_pull_at_rest(osc, mode, x1) for mode in (right, left))
@@ -426,14 +429,14 @@ def begins_at_rest(osc: Oscillator, x1: Array, x2: Array) -> Array:
 
 
 def _sides(osc: Oscillator, x1: Array, x2: Array) -> tuple[Mode, Mode]:
-    """The modes just right and just left of a state; where it is on no edge they are the same."""
+    """The modes just right and just left of a state; away from edges they are the same."""
     sides = (contact(osc, x1, x2, rightward=side) for side in (True, False))
     right, left = (settle(osc, mode, x1, x2) for mode in sides)
     return right, left
 
 
 def _pull_at_rest(osc: Oscillator, mode: Mode, x1: Array) -> Array:
-    """x2' at rest, (x1, 0): 0 where a belt holds the mass, and where it is but rounding."""
+    """x2' of a mass at rest at x1: 0 where a belt holds it, and where x2' is only rounding."""
     a = mode_acceleration(osc, mode, x1, jnp.zeros_like(x1))
     return jnp.where(mode.any_stuck, 0.0, without_rounding(a, x1))
 
@@ -456,6 +459,6 @@ def contact(osc: Oscillator, x1: Array, x2: Array, *, rightward: bool) -> Mode:
 
 
 def contact_beside(osc: Oscillator, x1: Array, x2: Array, *, rightward: bool) -> Mode:
-    """`contact` just beside x1, past all edges that are one with it up to rounding."""
+    """`contact` just beside x1, past all edges that are equal to x1 up to rounding."""
     away = jnp.where(jnp.isfinite(x1), force_rounding(x1), 0.0)
     return contact(osc, x1 + away if rightward else x1 - away, x2, rightward=rightward)

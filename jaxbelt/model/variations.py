@@ -1,12 +1,12 @@
-"""What is varied: a parameter of an oscillator, or whatever a function of numbers makes of it.
+"""Variations: oscillators as functions of one or two parameters, for diagrams, scans and fits.
 
 A `Variation` gives the oscillator at each value of one parameter, or of two. It is made from an
 oscillator and `where`, which selects its leaves, or from a function that returns the oscillator;
-who uses it does not know from which. Compiled programs are handed a `Family`: oscillators that are
-linear in the parameters, their leaves and slopes as data, so that one program serves every
-parameter and every function. Where a function is not linear, what was solved for in the family that
-is tangent to it at a guess is solved for again in the one that is tangent at the solution, until
-both are one oscillator there (`Variation.relinearised`). That is Newton's method once more.
+its users need not know which. Compiled programs are handed a `Family`: oscillators that are linear
+in the parameters, their leaves and slopes as data, so that one program serves every parameter and
+every function. Where a function is not linear, a problem is solved in the family that is tangent to
+it at a guess, then in the family that is tangent at the solution, and so on, until the family and
+the function have the same oscillator there (`Variation.relinearised`): Newton's method once more.
 """
 
 import functools
@@ -41,39 +41,40 @@ from .oscillator import (
 from .own_units import OwnOscillator, in_own_units, own_length, power_of_two_below
 from .parameters import is_number, is_real, leaf_index, names_of
 
-#: Numbers that differ by less, relative to their size beside 1, are the same but for rounding.
+#: Numbers that differ by less than this times 1 + their size are equal up to rounding.
 ROUNDING = 1e-14
-#: Numbers of an oscillator that differ by less are those of a point found there.
+#: Largest difference, over 1 + size, of the numbers of an oscillator from those that it is to have.
 SAME_NUMBER = 1e-9
-#: How often a nonlinear function is linearised anew. The distance is squared every time: 1e-1,
-#: 1e-2, 1e-4, 1e-8, 1e-16. Inside of a trace, where nobody looks, it is done so often in any case.
+#: Most linearisations of a nonlinear function. Each squares the distance: 1e-1, 1e-2, 1e-4, 1e-8,
+#: 1e-16. Inside a trace, where convergence cannot be tested, always TRACED_PASSES are made.
 PASSES, TRACED_PASSES = 12, 5
-#: Values between which zeros of velocities, and gaps between edges, are looked for, and how near
-#: two are taken for one.
+#: Number of parameter values between which zeros of velocities and meetings of edges are sought;
+#: zeros nearer to each other than MERGED count as one.
 VALUES_SEEN, MERGED = 257, 1e-7
-#: A function whose tangent was asked for more often is compiled, which takes a few tenths of a
-#: second; uncompiled that of a machine in SI units takes some 20 ms.
+#: Number of tangents of a function after which tangents are compiled, which takes a few tenths of a
+#: second; an uncompiled tangent of a machine in SI units takes some 20 ms.
 OFTEN = 64
-#: Guesses along each side of a plane for where an oscillator lies in it.
+#: Guesses along each parameter in `Variation.values_of`.
 GUESSES = 9
 
 
-#: The spans of a parameter that a forced oscillator may have.
+#: In messages: what the span of a parameter of a forced oscillator has to be.
 WITH_A_CLOCK = "without the frequency 0, at which a force is constant"
-#: What varies a parameter of an oscillator without a clock.
+#: In messages: what varies a parameter only of oscillators without a clock.
 VARIED = "this diagram, scan or set of fractions"
-#: What there is with forcing.
+#: In messages: what to use with forcing instead.
 FOR_FORCED = "jb.bifurcation_diagram(...) of a branch, jb.orbit_diagram or jb.sweep"
 
 
 @dataclass(frozen=True)
 class Variation:
-    """What is varied: oscillators by one parameter or two.
+    """Oscillators as a function of one parameter or two.
 
-    make: gives the oscillator at numbers; names: of the parameters; line: all of them, where they
-    are linear in the parameters; else tangents: those that are known, by the parameters.
-    varies_leaves: whether these are numbers of the oscillator, not arguments of a function. units:
-    those in which it is computed; None: the user's.
+    make: returns the oscillator at given parameters; names: names of the parameters; line: the
+    `Family` of all these oscillators if they are linear in the parameters, else None; tangents:
+    tangent families found so far, by the parameters' values. varies_leaves: whether the parameters
+    are leaves of an oscillator, not arguments of a function. units: own units of the variation;
+    None: the user's.
     """
 
     make: Callable[..., Oscillator]
@@ -85,7 +86,7 @@ class Variation:
 
     @classmethod
     def of_leaves(cls, osc: Oscillator, numbers: Sequence[int]) -> "Variation":
-        """An oscillator in which the leaves of these numbers are varied."""
+        """An oscillator in which the leaves with these numbers are varied."""
         leaves, structure = jax.tree.flatten(osc)
         slopes: list[Any] = [None] * len(leaves)
         for place, leaf in enumerate(leaves):
@@ -109,7 +110,7 @@ class Variation:
         *,
         forced: bool = False,
     ) -> "Variation":
-        """The oscillators that a function gives, `values` being some that are possible.
+        """The oscillators that a function returns; values: possible values of its arguments, [k].
 
         `ValueError`, naming `argument`, for a function of other arguments or results, for one that
         JAX cannot differentiate, and where an argument makes no difference.
@@ -151,7 +152,7 @@ class Variation:
         return found
 
     def _tangent(self, values: Any) -> Family:
-        """The oscillators that are tangent to the function there."""
+        """The `Family` that is tangent to the function at `values`, [k]."""
         structure, rest = None, []
 
         def numbers(*p):
@@ -184,8 +185,8 @@ class Variation:
         return eqx.filter_jit(lambda values: self._tangent(values))
 
     def family(self, values: Any) -> Family:
-        """Oscillators that are linear in the parameters, and those of the variation near `values`,
-        [k]."""
+        """The `Family` of the variation itself if this is linear, else the family that is tangent
+        at `values`, [k]."""
         if self.line is not None:
             return self.line
         if not is_concrete(values):
@@ -198,14 +199,14 @@ class Variation:
         return self.tangents[place]
 
     def oscillator(self, values: Any) -> Oscillator:
-        """The oscillator at these values, [k]; whether it is a possible one is not asked."""
+        """The oscillator at these values, [k]; not checked, it may be impossible."""
         if self.line is not None:
             return self.line.at(values)
         row = tuple(np.asarray(values).tolist()) if is_concrete(values) else None
         if row in self.tangents:
             return self.tangents[row].oscillator
         if row is not None and not np.all(np.isfinite(row)):
-            # A function of the user's would refuse it.
+            # A user's function would refuse such values.
             shapes = eqx.filter_eval_shape(self.make, *(jnp.asarray(value) for value in values))
             return jax.tree.map(
                 lambda leaf: jnp.full(leaf.shape, jnp.nan) if hasattr(leaf, "shape") else leaf,
@@ -215,23 +216,23 @@ class Variation:
         return jax.tree.map(lambda x: jnp.asarray(x, jnp.float64) if is_real(x) else x, made)
 
     def oscillators(self, rows: np.ndarray) -> Oscillator:
-        """Those at many values, [rows, k], as one with a row in each leaf."""
+        """The oscillators at many values [rows, k], as one whose leaves have a row for each."""
         if self.line is None:
             return eqx.filter_vmap(self.make)(*(jnp.asarray(column) for column in rows.T))
         return self.line.rows(rows)
 
     def coincidences(self, first: float, last: float) -> dict[float, list[tuple[int, ...]]]:
-        """Where, between two values of the one parameter, belts come to run at one velocity, two
-        numbers each, and then where a belt comes to rest, its number; all of them with a load."""
+        """Parameter values in [first, last] at which two belts with a load run at one velocity, or
+        one is at rest: dictionary from these values to the belts' numbers, pairs first."""
         belts = range(len(self.oscillator(np.array([first])).belts))
         which = [*combinations(belts, 2), *((belt,) for belt in belts)]
         velocities = [[(belt, "velocity") for belt in some] for some in which]
         return self._zeros_of(velocities, first, last)
 
     def meetings(self, first: float, last: float) -> dict[float, list[tuple[int, ...]]]:
-        """Where, between two values of the one parameter, contact edges of two belts meet, both
-        with a load, their numbers. At these values themselves, too, unless there can be no
-        oscillator beyond: an edge may have come there from where it cannot be."""
+        """As `coincidences`, values at which contact edges of two belts with a load meet. The ends
+        first and last count only if there can be an oscillator beyond: otherwise an edge may have
+        come there from where it cannot be."""
         belts = self.oscillator(np.array([first])).belts
         ends = [
             [(number, name) for name in ("lower", "upper") if np.isfinite(getattr(belt, name))]
@@ -257,8 +258,8 @@ class Variation:
     def _zeros_of(
         self, which: Sequence[Sequence[tuple[int, str]]], first: float, last: float
     ) -> dict[float, list[tuple[int, ...]]]:
-        """Where, between two values of the one parameter, numbers of belts, (belt, name) each, are
-        equal, or one is zero, if the belts have a load: these."""
+        """Parameter values in [first, last] at which two numbers (belt, name) of belts with a load
+        are equal, or one number is zero: dictionary from these values to the belts' numbers."""
         found: dict[float, list[tuple[int, ...]]] = {}
         for some in which:
             line, belts = self.line, tuple(belt for belt, _ in some)
@@ -276,7 +277,7 @@ class Variation:
         return found
 
     def _zeros(self, which: Sequence[tuple[int, str]], first: float, last: float) -> list[float]:
-        """As `Family.zeros`, between two values."""
+        """As `Family.zeros`, between two values of the parameter of a nonlinear variation."""
         from scipy.optimize import brentq, minimize_scalar  # late, as only functions need them
 
         def difference(osc):
@@ -295,7 +296,7 @@ class Variation:
             root: Any = brentq(at, rows[k], rows[k + 1], xtol=ROUNDING)
             zeros.append(float(root))
         size = np.abs(v)
-        # Where it comes to zero and turns back.
+        # Zeros at which the sign does not change.
         inner = (size[1:-1] <= size[:-2]) & (size[1:-1] < size[2:]) & (v[:-2] * v[2:] > 0)
         for k in 1 + np.flatnonzero(inner & (v[1:-1] != 0)):
             ends = rows[k - 1], rows[k + 1]
@@ -318,7 +319,7 @@ class Variation:
         require(fine, "span", WITH_A_CLOCK, tuple(map(float, span)))
 
     def held(self, axis: int, value: float) -> "Variation":
-        """The variation of the other of two parameters."""
+        """The variation by one of two parameters, with the parameter `axis` fixed at `value`."""
         free = 1 - axis
         pair = np.zeros(2)
         pair[axis] = value
@@ -339,7 +340,7 @@ class Variation:
         return Variation(make, (self.names[free],), line, units=units)
 
     def measured_in(self, units: Any) -> "Variation":
-        """The same with its parameters in these units, [k]."""
+        """The same variation with its parameters measured in these units, [k]."""
         if is_concrete(units) and np.all(units == 1.0):
             return self
         line = None
@@ -372,16 +373,17 @@ class Variation:
         """
         if self.units is not None:
             return self
-        # Not the first of several: between the ends there may be no possible oscillator.
+        # The first of several rows is left out: an oscillator between the ends may be impossible.
         ends = rows[1:] or rows
         lengths = [own_length(self.oscillator(values)) for values in ends]
         one: Any = np if is_concrete(lengths) else jnp
         return self.in_units(functools.reduce(one.maximum, lengths), rows[0], ends)
 
     def in_units(self, length: Any, values: Any, ends: Sequence[Any] = ()) -> "Variation":
-        """As `in_own_units`, in a given unit of length; those of the parameters are at `values`.
+        """As `in_own_units`, with a given unit of length; the units of the parameters are taken at
+        `values`, [k].
 
-        ends: values at which there are oscillators; none: `values`.
+        ends: values at which the oscillators are possible; none: `values`.
         """
         edges = any(self._may_have_edges(possible) for possible in ends or (values,))
 
@@ -391,7 +393,7 @@ class Variation:
         own = Variation(make, self.names, None, varies_leaves=self.varies_leaves)
         if self.line is not None:
             if not _varies_omega(self.line):
-                # Linear, as the units are fixed.
+                # Still linear, because the units are fixed.
                 own = replace(own, line=own._tangent(np.asarray(self.line.origin)))
         units = [power_of_two_below(unit) for unit in own.family(values).units]
         pack: Any = np if is_concrete(units) else jnp
@@ -421,7 +423,7 @@ class Variation:
         return any(depends(bounds, *values)) or has_edges(self.make(*values))
 
     def rest_of(self, belt: int, start: float) -> float:
-        """The value, near `start`, of the one parameter, at which a belt is at rest."""
+        """The value of the only parameter, near `start`, at which a belt is at rest."""
         value = float(start)
         for _ in range(PASSES):
             before, (value,) = value, self.family(np.array([value])).zeros([(belt, "velocity")])
@@ -432,10 +434,11 @@ class Variation:
     def relinearised(
         self, attempt: Callable[[Family, Any], tuple[Any, Any]], unknowns: Any
     ) -> tuple[Any, Any]:
-        """What an attempt finds in the family that is tangent where it ends, and whether it is.
+        """Result of an attempt in the family that is tangent at its own solution, and whether the
+        family and the variation agree there.
 
-        attempt: of a family and the unknowns to begin from, the last ones of which are the
-        parameters, [k]; gives what it found and the unknowns there.
+        attempt: function of a family and of the unknowns to begin from, the last of which are the
+        parameters, [k]; returns its result and the unknowns at the solution.
         """
         if self.line is not None:
             return attempt(self.line, unknowns)[0], True
@@ -461,10 +464,10 @@ class Variation:
         return found, False
 
     def values_of(self, osc: Oscillator, span: np.ndarray, start: Any = None) -> np.ndarray | None:
-        """Where an oscillator lies among those of the variation, [k]; None where it is none.
+        """The parameters, [k], at which the variation gives `osc`; None if it never does.
 
-        span: the first and last value of each parameter, [k, 2], between which it is looked for;
-        start: where to begin. By the method of Gauss and Newton.
+        span: the first and last value of each parameter, [k, 2], between which they are sought;
+        start: a guess, [k], or None. By the method of Gauss and Newton.
         """
         if jax.tree.structure(osc) != jax.tree.structure(self.oscillator(span[:, 0])):
             return None
@@ -498,8 +501,9 @@ class Variation:
 
 
 class UnitsOfVariation(NamedTuple):
-    """What is varied as the user gave it, and what its units are in those of the user: of length,
-    and of each parameter, [k]. edges: whether any oscillator may have a contact edge."""
+    """Own units of a variation. given: the variation in the user's units; length: unit of length,
+    parameters: units of the parameters, [k], both in the user's units. edges: whether any
+    oscillator may have a contact edge."""
 
     given: Variation
     length: Any
@@ -517,8 +521,8 @@ def _varies_omega(line: Family) -> bool:
 
 
 def as_span(osc: Any, where: Any, span: Any) -> tuple[float, float]:
-    """The span of a parameter, or a `ValueError`, of `where` first: where this is left out, the
-    span stands in its place."""
+    """The span of a parameter. `ValueError` for a wrong `where` first: if `where` was left out, the
+    span may stand in its place."""
     if isinstance(osc, Oscillator):
         leaf_index(osc, where)
     numbers = isinstance(where, tuple | list | np.ndarray) and len(where) == 2
@@ -529,8 +533,8 @@ def as_span(osc: Any, where: Any, span: Any) -> tuple[float, float]:
 
 
 def varied(osc: Any, where: Any, values: Sequence[Any], *, forced: bool = False) -> Variation:
-    """What an entry is to vary, by one parameter, from what it was given: an oscillator and
-    `where`, or a function alone, or what is varied. values: a possible one of the parameter."""
+    """The `Variation` by one parameter that a public function was given: an oscillator and `where`,
+    or a function alone, or a `Variation`. values: a possible value of the parameter, [1]."""
     if isinstance(osc, Variation):
         return osc
     if callable(osc) and not isinstance(osc, Oscillator):
@@ -545,7 +549,7 @@ def varied(osc: Any, where: Any, values: Sequence[Any], *, forced: bool = False)
 
 
 def _by_position(make: Any, count: int, argument: str, expected: str):
-    """A function that takes so many numbers, one after another, and the names of its arguments."""
+    """`make` as a function of `count` numbers by position, and the names of its arguments."""
     require_callable(make, argument, expected)
     try:
         signature = inspect.signature(make)

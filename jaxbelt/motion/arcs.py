@@ -7,11 +7,11 @@ In a slip arc the orbit runs in the smooth field of its mode until one of these 
   most: the sign of a guard after a step shows whether it was met, and its sign at the extremum
   itself whether an orbit that grazes a boundary meets it.
 
-An integrator marches until a step ends outside; that step is then made once more, shorter, so that
-it ends on the first root, see `roots`. A stick arc is known in closed form.
+An integrator marches until a step ends outside of the mode; that step is then made once more,
+shorter, so that it ends on the first root, see `roots`. A stick arc is known in closed form.
 
-`simulate` and the orbits behind cycles are made of these arcs, and share what follows at their
-ends.
+`simulate` and the orbits behind cycles are made of these arcs, and share the code for what follows
+at their ends.
 """
 
 import functools
@@ -44,13 +44,13 @@ Signs = tuple[Array, Array]
 
 
 class Ends:
-    """Numbers for what ends an arc, for n belts.
+    """Numbers of the things that may end an arc, for n belts.
 
     i < n: the boundary of belt i; n <= i < 3n: the edge i - n of `modes.edges`; then the extremum
-    x2' = 0 of x2, the extremum x2 = 0 of x1, and slip onset. For shooting there follow an arc that
-    is not used, and from there on a tangency to the boundary of belt i. With a clock a tangency is
-    where r_i' = 0, and last come the end of a period, and where what a stick phase needs comes
-    nearest to the limit.
+    x2' = 0 of x2, the extremum x2 = 0 of x1, and slip onset. For shooting there follow `unused`, an
+    arc that is not used, and from `tangent` on a tangency to the boundary of belt i. With a clock a
+    tangency is where r_i' = 0, and last come `period`, the end of a period, and `nearest_limit`,
+    where the needed force of a stick phase comes nearest to its limit.
     """
 
     def __init__(self, n: int):
@@ -63,9 +63,9 @@ class Ends:
 class ArcEnd(eqx.Module):
     """How an arc ends, and how the orbit goes on.
 
-    duration: of the arc; ended_by: a number of `Ends`, or -1: nothing; y, mode, signs: from there
-    on. captured: by a pseudo-focus; forever: the mass stays stuck; failed: the
-    integrator gave up.
+    duration: of the arc; ended_by: a number of `Ends`, -1 if nothing ended it; y, mode, signs: from
+    there on. captured: whether by a pseudo-focus; forever: whether the mass stays stuck; failed:
+    whether the integrator gave up.
     """
 
     duration: Array
@@ -98,11 +98,11 @@ def _all_guards(osc: Oscillator, mode: Mode, signs: Signs, x1: Array, x2: Array)
 def _that_count(
     osc: Oscillator, mode: Mode, signs: Signs, guards: Array, every_extremum: bool
 ) -> Array:
-    """The guards of `_all_guards`, larger where they do not count.
+    """The guards of `_all_guards`, larger where they do not count, so that they do not fire.
 
-    A boundary or edge from which the orbit moves away until its next extremum does not; nor, unless
-    every extremum is to end an arc, does an extremum while what it protects is out of reach of one
-    step.
+    A boundary or edge from which the orbit moves away until its next extremum does not count. Nor
+    does an extremum of x2 (x1), unless every extremum is to end an arc, while the boundaries
+    (edges) are out of reach of one step.
     """
     n = len(osc.belts)
     boundary, edge, extrema = guards[:n], guards[n : 3 * n], guards[3 * n :]
@@ -118,7 +118,7 @@ def _that_count(
 
 
 class SlipArc(eqx.Module):
-    """End of a slip arc: its duration and state, what ended it (as in `ArcEnd`), failure."""
+    """The end of a slip arc: duration, state, what ended it (as in `ArcEnd`), failure."""
 
     duration: Array
     y: State
@@ -164,7 +164,7 @@ def arc_to_guard(
     *,
     every_extremum: bool,
 ) -> SlipArc:
-    """`slip_arc` in a field of one's own. guards_of(*y): the guards in the order of `Ends`."""
+    """`slip_arc` in the given field. guards_of(*y): the guards in the order of `Ends`."""
 
     def count(guards):
         return _that_count(osc, mode, signs, guards, every_extremum)
@@ -174,7 +174,7 @@ def arc_to_guard(
 
     last = integrator.march(field, y, is_outside)
     root, ended_by = _first_guard(field, guards_of, last, integrator, count)
-    # Where not every extremum ends an arc nothing depends on where exactly one does.
+    # Unless every extremum ends an arc, nothing depends on where exactly an extremum ends one.
     is_sharp = last.outside & (every_extremum | (ended_by < 3 * len(osc.belts)))
 
     def guard_fired(*y):
@@ -196,7 +196,7 @@ def arc_to_guard(
 
 
 def _first_guard(field, guards_of, last, integrator, count) -> tuple[Array, Array]:
-    """When within the last step a guard first vanishes, and which."""
+    """The time within the last step at which a guard first vanishes, and the guard's number."""
 
     def guards_at(y):
         values, slopes = jax.jvp(guards_of, y, field(y))
@@ -213,7 +213,7 @@ def _first_guard(field, guards_of, last, integrator, count) -> tuple[Array, Arra
 
 
 def after_slip(osc: Oscillator, mode: Mode, signs: Signs, arc: SlipArc) -> ArcEnd:
-    """How the orbit goes on at the end of a slip arc; at a pseudo-focus that captures it, at rest.
+    """How the orbit goes on at the end of a slip arc; if a pseudo-focus captures it, at rest.
 
     Where the arc ends at an extremum, or for want of time, the mode stays.
     """
@@ -241,7 +241,7 @@ def after_slip(osc: Oscillator, mode: Mode, signs: Signs, arc: SlipArc) -> ArcEn
 
 
 def stick_arc(osc: Oscillator, mode: Mode, y: State, longest: Array) -> ArcEnd:
-    """The stick arc from y to its end, or, where that is finite, for the time `longest`."""
+    """The stick arc from y to its end, or for the time `longest` if this is finite and shorter."""
     x1, n = y[0], len(osc.belts)
     phase = stick_phase(osc, mode, x1)
     is_cut = (phase.duration >= longest) & (longest < jnp.inf)

@@ -1,8 +1,8 @@
 """Many runs of `simulate` at once, through the lanes of `kernel`.
 
-Runs are done in groups, side by side. A round of a group is some steps of all its lanes; their
-events are recorded, round after round. The arcs of a run, their events and its samples are then
-taken from these records. A loop that a run repeats is followed once, see `kernel.marks`.
+Runs are followed in groups, side by side. A round of a group is some steps of all its lanes; the
+events of all rounds are recorded in a book. The arcs of a run, their events and its samples are
+then taken from this record. A loop that a run repeats is followed once, see `kernel.marks`.
 
 The kernel cannot finish a few runs, such as those at rest on a guard; they are run again one by
 one.
@@ -32,27 +32,27 @@ from .loops import RepeatedLoop
 LANES_AT_ONCE = SideBySide(on_cpu=128, elsewhere=2**14)
 #: Rounds that one piece of machine code makes.
 PAGE = 8
-#: An arc of a batch ends where a multiple of this time is passed: longer ones would take more steps
-#: for their derivatives, of the whole and of samples within.
+#: An arc of a batch ends where a multiple of this time is passed: longer arcs would take more steps
+#: for derivatives, those of the whole arc and those of samples within.
 LONGEST_ARC = 2.0
-#: Arcs of each run that are looked up at once: most have far fewer than there is room for.
+#: Arcs of each run that are looked up at once: most runs have far fewer than there is room for.
 ARCS_AT_ONCE = 64
-#: Rounds of all lanes for which a book has room, of 180 bytes each; a group of fewer lanes where it
-#: has to have more for each.
+#: Capacity of a book, in rounds of single lanes, of 180 bytes each; if a lane may need many rounds,
+#: a group has fewer lanes.
 BOOK = SideBySide(on_cpu=2**20, elsewhere=2**24)
 #: The tolerance of a lane's steps over that of the run. A run by itself is far more accurate than
-#: its tolerance, and is to be the same in a batch; at order eight a hundred times the accuracy
+#: its tolerance, and has to be the same in a batch; at order eight a hundred times the accuracy
 #: takes 1.8 times the steps.
 SHARE = 1e-2
-#: Tolerances below this are those of rounding.
+#: Smallest tolerance of a lane's steps; smaller ones would ask for less than rounding.
 LEAST_TOLERANCE = 1e-13
 
 
 class Batch(NamedTuple):
-    """What all groups of a batch have in common.
+    """Sizes that all groups of a batch have in common.
 
-    width: lanes of a group; rounds: room for so many; rows: room for the arcs of a run that are
-    followed; most: arcs of a run, at most; belts: how many.
+    width: lanes of a group; rounds: capacity of its book; rows: capacity for the arcs of a run that
+    are followed; most: largest number of arcs of a run; belts: number of belts.
     """
 
     width: int
@@ -65,9 +65,9 @@ class Batch(NamedTuple):
 class Group(NamedTuple):
     """The runs of a group, arrays [.., lanes].
 
-    lanes: at the end; arcs: columns of `runs.ArcRecord` by name, [rows, lanes]; used: which of the
-    rows are; loop: that they repeat; samples: [samples, 2, lanes]; alone: runs that have to be
-    followed by themselves.
+    lanes: at the end of the runs; arcs: columns of `runs.ArcRecord` by name, [rows, lanes]; used:
+    mask of the rows that hold an arc, [rows, lanes]; loop: the loops that the runs repeat; samples:
+    [samples, 2, lanes]; alone: mask of runs that have to be followed one by one.
     """
 
     lanes: Lanes
@@ -79,7 +79,7 @@ class Group(NamedTuple):
 
 
 def blank_book(osc, batch: Batch) -> Round:
-    """Room for the rounds of a group, [rounds, ..]; osc: an oscillator of the lanes."""
+    """An empty book for the rounds of a group, [rounds, ..]; osc: an oscillator of the lanes."""
     ones = jnp.ones(batch.width)
 
     def kept(osc):
@@ -100,7 +100,7 @@ def _first_lanes(osc, y0, rtol, batch: Batch) -> Lanes:
 def followed_together(
     osc: Oscillator, y0, span, ts, rtol, atol, batch: Batch, book: Round
 ) -> tuple[Group, Round]:
-    """The runs of a group, and its book, in place of an older one.
+    """The runs of a group, and its book, which takes the place of the `book` given.
 
     osc: leaves are scalars or [lanes]; y0: (x1, x2), [lanes] each; span: t1 - t0, [lanes]; ts:
     times since t0, [samples, lanes].
@@ -121,8 +121,8 @@ def followed_together(
 
 
 def _written(osc, lanes, ones, span, tolerances, batch: Batch, book) -> tuple[Lanes, Round, Array]:
-    """Rounds until the lanes are done, or there is no more room: the lanes at the end, the book,
-    and how many rounds there were."""
+    """Makes rounds until all lanes are done or the book is full: returns the lanes at the end, the
+    book, and the number of rounds."""
 
     @one_kernel
     def page(osc, lanes, ones, span, rtol, atol):
@@ -147,9 +147,9 @@ def _written(osc, lanes, ones, span, tolerances, batch: Batch, book) -> tuple[La
 class _Chains(NamedTuple):
     """The arcs of the lanes, as chains of the phases of their rounds.
 
-    In each round there may be two: the phase in which a lane sticks, and its steps. begun, ended:
-    how many arcs had begun, and ended, behind each phase, [2 rounds, lanes]; fires: whether the
-    steps of a round end on a guard, [rounds, lanes].
+    A round has two phases, of which one may be empty: a stick phase, and the lane's steps. begun,
+    ended: how many arcs have begun, and ended, by the end of each phase, [2 rounds, lanes]; fires:
+    whether the steps of a round end on a guard, [rounds, lanes].
     """
 
     begun: Array
@@ -159,11 +159,11 @@ class _Chains(NamedTuple):
 
 def _chains(book: Round, inside: Array) -> _Chains:
     """Which phases belong to one arc: steps in one mode, while x2 moves one way."""
-    # What ended the steps is written in the round after.
+    # What ended the steps of a round is recorded in the next round.
     fires = _row_after(book.fired & inside)
     first, last = book.ts[0], book.ts[-1]
     slips, sticks = inside & ((last > first) | fires), book.stuck & inside
-    # Between two extrema of x2, so that the law bends most at one of the ends.
+    # Arcs are cut at extrema of x2, so that the law bends most at one of their ends.
     way, part = book.x2s[-1] >= book.x2s[0], jnp.floor(first / LONGEST_ARC)
     goes_on = (way == _row_after(way)) & (part == _row_after(part)) & _row_after(slips & ~sticks)
     goes_on = slips & ~fires & goes_on
@@ -178,7 +178,7 @@ def _chains(book: Round, inside: Array) -> _Chains:
 
 
 def _row_after(rows: Array) -> Array:
-    """Each row's next one; of the last, which is never used, the first."""
+    """The rows shifted by one, each replaced by the next; the last, never used, by the first."""
     return jnp.roll(rows, -1, axis=0)
 
 
@@ -210,7 +210,7 @@ def _arcs(book: Round, inside: Array, repeat: LoopSearch, batch: Batch):
     arcs, used = jax.tree.map(lambda leaf: leaf.reshape(-1, batch.width)[: batch.rows], parts)
 
     def behind(number):
-        """How many arcs had ended behind the stick phase of a round."""
+        """Number of arcs that have ended by the end of the stick phase of a round."""
         return jnp.take_along_axis(chains.ended, 2 * number[None], axis=0)[0]
 
     loop = RepeatedLoop(behind(repeat.first), behind(repeat.last), repeat.loops)
@@ -220,7 +220,7 @@ def _arcs(book: Round, inside: Array, repeat: LoopSearch, batch: Batch):
 
 
 def _arcs_from(first, size: int, book: Round, chains: _Chains, repeat: LoopSearch, batch: Batch):
-    """So many arcs of the lanes from that number on, and which of them there are."""
+    """The `size` arcs of each lane after its first `first` ones, and a mask of existing ones."""
     wanted, total = first + jnp.arange(1, size + 1, dtype=jnp.int32), chains.begun[-1]
     there = wanted[:, None] <= total[None]
 
@@ -243,7 +243,7 @@ def _arcs_from(first, size: int, book: Round, chains: _Chains, repeat: LoopSearc
     next_codes = codes_in(either(at(book.mode, after), at(book.mode_after, row)), batch.belts)
     kind, belt = event_between(tuple(codes), tuple(next_codes))
     begins = at(book.ts[0], row)
-    # Behind the stick phase at whose end a loop repeats, the run goes on behind the last loop.
+    # After the stick phase at whose end a loop repeats, the run goes on behind the last loop.
     repeats = (repeat.loops > 0)[None] & (row == repeat.last[None])
     released = jnp.where(repeats, repeat.t[None], begins)
     t, t_end = either(begins, at(book.t, row)), either(at(book.ts[-1], last_row), released)
@@ -276,7 +276,7 @@ def _searched(columns: Array, values: Array, side: str) -> Array:
 
 
 def _samples(osc, book: Round, inside: Array, ones, ts, batch: Batch) -> Array:
-    """The states of the lanes at some times, each from the step that it lies in."""
+    """The states of the lanes at the times ts, each taken from the step that it lies in."""
 
     passed = _searched(jnp.where(inside, book.t, jnp.inf), ts, "right")
     row = jnp.maximum(passed - 1, 0)
@@ -285,7 +285,7 @@ def _samples(osc, book: Round, inside: Array, ones, ts, batch: Batch) -> Array:
         return jnp.take_along_axis(column, row, axis=0)
 
     begins = [at(column) for column in (book.t, *book.ts[:-1])]
-    # In the round: while it sticks, or in which of its steps.
+    # The place of each time in its round: 0 in the stick phase, else the number of the step.
     place = sum((begin <= ts).astype(jnp.int32) for begin in begins[1:])
     is_first = place == 0
 
@@ -305,7 +305,7 @@ def _samples(osc, book: Round, inside: Array, ones, ts, batch: Batch) -> Array:
     def sample(osc, ones, x1, x2, since, mode, is_first):
         slip = Mode(tuple(jnp.where(is_first, 1.0, c) for c in codes_in(mode, batch.belts)))
         flown = flown_on(osc, ones, slip, x1, x2, since)
-        # In the first place a lane is stuck.
+        # At place 0 a lane is stuck.
         carried = x1 + x2 * since, x2
         return tuple(jnp.where(is_first, a, b) for a, b in zip(carried, flown, strict=True))
 

@@ -1,7 +1,8 @@
-"""Flights: arcs that are known, flown again for their derivatives, many side by side.
+"""Flights: arcs that are known, integrated again for their derivatives, many side by side.
 
-Each is flown by a number of steps that is fixed beforehand, so there is nothing to search and to
-control; flights that take about as many steps are made together, in one piece of machine code.
+Each takes a number of steps that is fixed beforehand, so there are no events to search for and no
+step sizes to control; flights of about as many steps are made together, in one piece of machine
+code.
 """
 
 import functools
@@ -31,27 +32,27 @@ from ..numerics.extrapolation import increments, scheme
 from ..numerics.widths import SideBySide
 from .integrators import State, density, slip_field
 
-#: A step of order twelve times the density of steps that is wanted there. Of 5,000 arcs of random
-#: oscillators nine in ten were then right to 1e-12, all to 1e-8.
+#: Length of a step of order twelve, times the density of steps that is wanted there. Of 5,000 arcs
+#: of random oscillators nine in ten were then right to 1e-12, all to 1e-8.
 LENGTH = 0.3
-#: Most steps of an arc, in groups of groups: most arcs need a few, stiff ones, and those that begin
-#: in the bend of the law with a large acceleration, thousands.
+#: Largest number of steps of an arc, in groups of groups: most arcs need a few. Stiff arcs, and
+#: arcs that begin in the bend of the law with a large acceleration, need thousands.
 GROUPS = (8, 32, 16, 4)
 MOST_STEPS = math.prod(GROUPS)
 #: Arcs that are flown side by side, at most.
 FLOWN_AT_ONCE = SideBySide(on_cpu=64, elsewhere=2**16)
-#: Runs, at most, and arcs of each, that are sorted by their numbers of steps together; and how many
-#: arcs these are, at most: with `MOST_STEPS` each still a whole number of 32 bits, for sorting.
+#: Most runs, and most arcs of each, that are sorted by their numbers of steps together; and most
+#: arcs that these may be: their number times `MOST_STEPS` has to fit into 32 bits, for sorting.
 RUNS, ROWS = SideBySide(on_cpu=128, elsewhere=2**14), 128
 MOST_FLIGHTS = SideBySide(on_cpu=2**11, elsewhere=2**16)
-#: Arcs whose steps are found at once.
+#: Arcs whose `Steps` are computed at once.
 LOOKED_AT = SideBySide(on_cpu=128, elsewhere=2**16)
-#: Groups into which these are divided, at least.
+#: Least number of groups into which arcs that are sorted together are divided.
 LEAST_GROUPS = SideBySide(on_cpu=16, elsewhere=1)
-#: Largest density of steps, so that all numbers stay finite.
+#: Largest density of steps; it keeps all numbers finite.
 DENSEST = 1e4
-#: Along an arc the steps vary by the ratio of the densities at its ends to this power: between the
-#: ends the law bends less than in the middle between them.
+#: Along an arc the steps vary by the ratio of the densities at its ends to this power: in between
+#: the law bends less than the mean of both ends.
 POWER = 1.5
 
 _ORDER_12 = scheme((2, 4, 6, 8, 10, 12))
@@ -62,8 +63,8 @@ class Arc(eqx.Module):
 
     The end helps to place the steps. ended_by: a number of `arcs.Ends`, -1 for none; in_time:
     whether the run ended with it, in time; captured: whether the mass came to rest in a
-    pseudo-focus at its end; used: whether there was such an arc at all. begins_loop, again: where
-    the loop that the run repeats begins behind it, and how many more times it is passed behind it.
+    pseudo-focus at its end; used: whether this row holds an arc. begins_loop: whether the loop that
+    the run repeats begins at its end; again: how many more times the run passes this loop there.
     """
 
     entry: State
@@ -84,7 +85,7 @@ class Arc(eqx.Module):
 
 
 class Steps(NamedTuple):
-    """Steps that are fixed beforehand: how many, and how they are graded, see `steps_of`."""
+    """Steps that are fixed beforehand: their number, and how they are graded, see `steps_of`."""
 
     number: Array
     is_even: Array
@@ -99,7 +100,7 @@ def steps_of(osc: Oscillator, arc: Arc, ones: Array) -> Steps:
     """
     osc, arc = lax.stop_gradient((osc, arc))
     mode, duration, y, end = arc.mode, arc.duration, arc.entry, arc.end
-    # Of both places at once, which takes half as long to compile.
+    # Both ends in one call, which takes half as long to compile.
     wanted = jax.vmap(lambda *y: density(osc, mode, *y))(
         *(jnp.stack(pair) for pair in zip(y, end, strict=True))
     )
@@ -129,7 +130,7 @@ def flown(osc: Oscillator, mode: Mode, y: State, duration: Array, steps: Steps) 
         return slip_field(osc, mode, y)
 
     def advance(passed, y, groups):
-        """Past the steps behind those that are passed, as many as fit into the groups."""
+        """The state after more steps than the `passed` ones, as many as fit into the groups."""
         if not groups:
             h = duration * (place(passed + 1) - place(passed))
             (change,) = increments(field, y, h, _ORDER_12)
@@ -138,13 +139,13 @@ def flown(osc: Oscillator, mode: Mode, y: State, duration: Array, steps: Steps) 
 
         def some(i, y):
             begin = passed + i * math.prod(parts)
-            # In groups, for stepping over the steps that an arc does not need is not free.
+            # In groups, because skipping the steps that an arc does not need is not free.
             return lax.cond(any_lane(begin < number), advance_some, lambda *_: y, begin, y)
 
         def advance_some(begin, y):
             return advance(begin, y, parts)
 
-        # Made again, not kept, where a derivative of a derivative comes back through them.
+        # Recomputed, not stored, where reverse mode comes back through them (second derivatives).
         return lax.fori_loop(0, size, jax.checkpoint(some, prevent_cse=False), y)
 
     end = advance(0, y, GROUPS)
@@ -153,7 +154,7 @@ def flown(osc: Oscillator, mode: Mode, y: State, duration: Array, steps: Steps) 
 
 
 def _flown_again(osc: Oscillator, arc: Arc, steps: Steps, *y: Array) -> State:
-    """The end of an arc that is known, where it slips, by oscillator and entry near those of it."""
+    """The end of a known arc, if it slips, as a function of oscillator and entry near its own."""
     return flown(osc, arc.mode, y, jnp.where(arc.mode.any_stuck, 0.0, arc.duration), steps)
 
 
@@ -161,10 +162,11 @@ def _flown_again(osc: Oscillator, arc: Arc, steps: Steps, *y: Array) -> State:
 
 
 def _side_by_side(function: Callable, by_run) -> Callable:
-    """function(by_run, varied, rest, *rows) of runs side by side, as a function of the others.
+    """function(by_run, varied, rest, *rows) of runs side by side, as a function of varied, rest and
+    rows; under `vmap` a batch becomes so many more runs.
 
-    rows are arrays [runs, ..], and so are the leaves of the oscillator for which by_run, a tree of
-    flags like (varied, rest), says it. A batch of it is so many more runs.
+    rows: arrays [runs, ..]; so are those leaves of the oscillator that are flagged in by_run, a
+    tree of flags like (varied, rest).
     """
 
     def call(varied, rest, *rows):
@@ -184,20 +186,20 @@ def _side_by_side(function: Callable, by_run) -> Callable:
 
 
 def of_one_run(function: Callable, varied, rest, *rows):
-    """The function of runs side by side, see `_side_by_side`, for one run."""
+    """A function of runs side by side, see `_side_by_side`, applied to one run."""
     call = _side_by_side(function, jax.tree.map(lambda _: False, (varied, rest)))
     out = call(varied, rest, *jax.tree.map(lambda leaf: leaf[None], rows))
     return jax.tree.map(lambda leaf: leaf[0], out)
 
 
 def sizes_of(by_run, varied) -> list[int]:
-    """How many numbers each leaf has for one run."""
+    """How many numbers each leaf of `varied` has for one run."""
     pairs = zip(jax.tree.leaves(varied), jax.tree.leaves(by_run[0]), strict=True)
     return [leaf.size // leaf.shape[0] if flag else leaf.size for leaf, flag in pairs]
 
 
 def largest_power(number: int) -> int:
-    """The largest that is not above the number, 1 or more."""
+    """The largest power of two <= number, for number >= 1."""
     return 1 << (number.bit_length() - 1)
 
 
@@ -205,14 +207,15 @@ def slopes_of(result, by_run, varied, rest, run, arcs: Arc, times, wanted):
     """Derivatives of flights, arrays [flights, d + 1 + varied] for each number of the result: by
     the d parts of the entry, by a time, and by the parameters.
 
-    result(osc, arc, end, y, time): of one flight, scalars, by its end; arcs: the flights, their
-    leaves arrays [flights, ..]; times, and whether each is wanted: arrays [flights], a power of two
-    of them; run: to which run each belongs. Those of about as many steps are made side by side.
+    result(osc, arc, end, y, time): numbers of one flight, scalars, from its end; arcs: the flights,
+    their leaves arrays [flights, ..]; times, and whether each is wanted: arrays [flights], with a
+    power of two of flights; run: the run of each flight, [flights]. Flights of about as many steps
+    are made side by side.
     """
     flights, count = times.size, len(arcs.entry) + 1 + sum(sizes_of(by_run, varied))
     own, shared = eqx.partition((varied, rest), by_run)
     own = jax.tree.map(lambda leaf: leaf[run], own)
-    # In one array, because XLA gathers, and takes the part of each group from, one at a time.
+    # In one array, because XLA gathers and slices every array by itself.
     table, unpack = _packed((own, arcs, times))
 
     number, is_even, ratio = _all_steps(by_run, shared, table, unpack)
@@ -222,7 +225,7 @@ def slopes_of(result, by_run, varied, rest, run, arcs: Arc, times, wanted):
     # Sorted with their places as one number: a sort of pairs takes ten times as long.
     order = jnp.sort(short * flights + numbers) % flights
     places = jnp.zeros_like(order).at[order].set(numbers, unique_indices=True)
-    # A few groups at least, for all of a group wait for the longest.
+    # A few groups at least, because all flights of a group wait for the longest.
     most = min(FLOWN_AT_ONCE.here, largest_power(max(1, LARGEST.here // count)))
     size = min(most, max(1, flights // LEAST_GROUPS.here))
     graded = jnp.stack([number, is_even, ratio, wanted.astype(float)], axis=1)
@@ -238,7 +241,7 @@ def slopes_of(result, by_run, varied, rest, run, arcs: Arc, times, wanted):
     def group(columns):
         shapes = jax.eval_shape(made, shared, columns)
         nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes)
-        # A kernel that is not in a branch of its own has no second derivatives in a loop (JAX
+        # In a branch, because a kernel outside of one has no second derivatives in a loop (JAX
         # 0.10).
         some = any_lane(jnp.any(columns[-1] > 0))
         return lax.cond(some, lambda: made(shared, columns), lambda: nothing)
@@ -270,13 +273,13 @@ def _all_steps(by_run, shared, table: Array, unpack: Callable) -> Array:
 
 
 def _as_columns(table: Array, size: int) -> Array:
-    """The rows of a table in groups of so many, as columns, [groups, columns, size]."""
+    """The rows of a table in groups of `size`, as columns, [groups, columns, size]."""
     return jnp.swapaxes(table.reshape(-1, size, table.shape[1]), 1, 2)
 
 
 def _packed(tree) -> tuple[Array, Callable]:
-    """The numbers of a tree of arrays [rows, ..] as one array, [rows, numbers]; and how to have the
-    tree again from its columns, [numbers, rows]."""
+    """The numbers of a tree of arrays [rows, ..] as one array, [rows, numbers]; and a function that
+    restores the tree from columns, [numbers, rows]."""
     leaves, structure = jax.tree.flatten(tree)
     rows = leaves[0].shape[0]
     parts = [leaf.reshape(rows, -1).astype(float) for leaf in leaves]
@@ -295,7 +298,7 @@ def _packed(tree) -> tuple[Array, Callable]:
 
 
 def _slopes_together(result, by_run, varied, rest, arcs: Arc, times, steps: Steps):
-    """The derivatives of flights that are made together, arrays [d + 1 + varied, flights], see
+    """The derivatives of flights that are computed together, arrays [d + 1 + varied, flights], see
     `slopes_of`."""
     axes, parts_of_entry = axes_of(by_run), len(arcs.entry)
 
@@ -328,7 +331,7 @@ def _slopes_together(result, by_run, varied, rest, arcs: Arc, times, steps: Step
         slopes = along, moved, *by_entry, jnp.full_like(times, 1.0) * time
         return jax.jvp(results, (varied, end, *arcs.entry, times), slopes)[1]
 
-    # The time has no part in the flight itself.
+    # The flight itself does not depend on the time.
     directions = jnp.eye(parts_of_entry + sum(sizes_of(by_run, varied)))
     end, moved = jax.vmap(flight, out_axes=(None, 0))(directions)
 
@@ -342,7 +345,7 @@ def _slopes_together(result, by_run, varied, rest, arcs: Arc, times, steps: Step
 
 
 def _directed(by_run, varied, numbers: Array):
-    """A tree like `varied`, of these numbers, the same for all runs."""
+    """A tree like `varied`, made of these numbers, the same for all runs."""
     leaves, structure = jax.tree.flatten(varied)
     parts, before = [], 0
     for leaf, flag in zip(leaves, jax.tree.leaves(by_run), strict=True):

@@ -33,9 +33,10 @@ Field = Callable[[Any], State]
 MAX_FRACTION, FIRST_FRACTION = 0.5, 0.2
 #: Steps of `Adaptive` before an arc is given up.
 MAX_ADAPTIVE_STEPS = 100_000
-#: A step of `Graded` times the wanted density. From there Newton's method takes two steps, mostly.
+#: Length of a step of `Graded`, times the wanted density. Newton's method mostly takes two steps
+#: from orbits of that accuracy.
 STRIDE = 0.2
-#: Steps of `Graded`, times their stride, before an arc, a quarter of a loop at most, is given up.
+#: Steps of `Graded`, times their stride, before an arc (a quarter of a loop at most) is given up.
 MAX_GRADED = 200.0
 
 _ORDER_8 = scheme((2, 4, 6, 8))
@@ -44,7 +45,7 @@ _ORDER_8 = scheme((2, 4, 6, 8))
 class LastStep(NamedTuple):
     """The last step of a march: when and where it began, its length, and the state at its end.
 
-    outside: whether that is outside of its mode; finished: whether it is, or the time is over.
+    outside: whether the end is outside of the mode; finished: whether it is, or the time is over.
     """
 
     t: Array
@@ -64,7 +65,7 @@ class AbstractIntegrator(eqx.Module):
 
         field: of the mode, also beyond its bounds. y: a state in the mode, or on a bound of it that
         the orbit moves away from. is_outside(y): a scalar, true beyond a bound of the mode. Returns
-        the last step, of which no end before was outside.
+        the last step; all steps before it ended inside.
         """
 
     def step(self, field: Field, y: State, h: Array) -> State:
@@ -74,7 +75,7 @@ class AbstractIntegrator(eqx.Module):
 
 
 def slip_field(osc: Oscillator, mode: Mode, y: State) -> State:
-    """The field (x1', x2') of a slip mode; with a clock (x1', x2', t'), of a stuck one, too."""
+    """The field (x1', x2') of a slip mode; with a clock (x1', x2', t'), also of a stick mode."""
     if has_clock(osc):
         x1, x2, t = y
         return field_at(osc, mode, (x1, x2, t))
@@ -151,19 +152,19 @@ class Adaptive(AbstractIntegrator):
         return tuple(end)
 
     def _integrate(self, field, y, ends_outside):
-        """The last step's beginning and end, (t, x1, x2) each, t as a fraction of the span, and
-        whether it ended outside.
+        """The beginning and the end of the last step, (t, x1, x2) each, t as a fraction of the
+        span, and whether it ended outside.
 
-        In units of the span the times are plain numbers: where they are not, diffrax checks them
-        with a callback, and that has no place in one kernel. Nor have the writes into arrays that
-        saving a result is in a batch; so the result is the solver's state.
+        In units of the span the times are plain numbers; others diffrax checks with a callback,
+        which cannot be part of one kernel. Nor can the writes into arrays by which it saves results
+        in a batch; so the result is read from the solver's state.
         """
 
         def scaled(t, y, args):
             return tuple(self.span * slope for slope in field(y))
 
         def norm(y):
-            # A lane that has nothing to do, and may be NaN, must not keep a batch waiting.
+            # A lane that has nothing to do, and may be NaN, must not keep the batch waiting.
             largest = functools.reduce(jnp.maximum, [jnp.abs(part) for part in y])
             return jnp.where(self.span > 0, largest, 0.0)
 
@@ -202,14 +203,14 @@ class Adaptive(AbstractIntegrator):
 
 
 def _oscillator_at(osc: Oscillator, y: State) -> Oscillator:
-    """The oscillator without a clock that it is at a state."""
+    """The oscillator without a clock that equals `osc` at a state, see `at_time`."""
     return at_time(osc, y[2]) if has_clock(osc) else osc
 
 
 class _Layers(eqx.Module):
-    """What thin layers of the friction laws at r = 0 ask of steps.
+    """Limits that thin layers of the friction laws at r = 0 set to steps.
 
-    thickness: over omega, of the layers of the belts that slip; inf where it is no thin one.
+    thickness: of the layer of each belt that slips, over omega; inf where the layer is not thin.
     """
 
     osc: Oscillator
@@ -218,7 +219,7 @@ class _Layers(eqx.Module):
 
     @classmethod
     def of(cls, osc: Oscillator, mode: Mode, field: Field, y: State, least: Array) -> "_Layers":
-        """least: a thickness below which a layer changes nothing that counts."""
+        """least: thickness below which a layer has no effect that counts; thinner ones get it."""
         none = jnp.zeros(())
         bends = [_bends(belt, none) for belt in _oscillator_at(osc, y).belts]
         bends = [
@@ -229,8 +230,9 @@ class _Layers(eqx.Module):
         return cls(osc, field, tuple(thin))
 
     def asked(self, start: State, end: State, h: Array, rtol: Array) -> tuple[Array, Array]:
-        """The share of its tolerance that x2 may be off by, see `share_of_tolerance`, and how many
-        steps this one has to be for none to jump a layer: each goes half of the way to it."""
+        """The share of the tolerance that the error of x2 may use, see `share_of_tolerance`, and
+        into how many steps this one has to be divided for none to jump a layer: each goes half of
+        the way to it."""
 
         a, now, later = (
             self.field(start)[1],
@@ -256,7 +258,7 @@ class _Layers(eqx.Module):
 
 
 #: Inverse thickness, in own units, of the thickest layer of a friction law at r = 0 that steps
-#: which do not look for it might jump.
+#: might jump unless they look for it.
 THIN = 30.0
 
 
@@ -275,12 +277,11 @@ def density(osc: Oscillator, mode: Mode, x1: Array, x2: Array, *t: Array) -> Arr
 
     With a clock, at the time t, also as many as the fastest wave wants.
 
-    The bend's inverse length is sqrt(u0 |mu''|), about p3 for Conti's law near r = 0. That of a
-    steep law tells nothing until the orbit is in its layer at r = 0, which a step of its own length
-    would jump: outside of a layer that is thinner than 1/`THIN` the length is the distance from it,
-    so that each step goes at most about half of the way. And at least half the rate at which
-    disturbances change in the linearised field: of that, the motion itself tells nothing where it
-    is small.
+    The bend's inverse length is sqrt(u0 |mu''|), about p3 for Conti's law near r = 0. For a steep
+    law it is small until the orbit is in the layer at r = 0, which a step of such a length would
+    jump: so outside of a layer that is thinner than 1/`THIN` the length is the distance from it,
+    and each step goes at most about half of the way. And the density is at least half the rate at
+    which disturbances change in the linearised field, which does not show in a small motion.
     """
     waves = [fastest(osc)] if has_clock(osc) else []
     now = _oscillator_at(osc, (x1, x2, *t))
@@ -304,7 +305,7 @@ def density(osc: Oscillator, mode: Mode, x1: Array, x2: Array, *t: Array) -> Arr
 
 
 def _relative_motions(osc: Oscillator, mode: Mode, a: Array, x1: Array, x2: Array, *t: Array):
-    """How fast the mass moves away from each belt, r', and r'' where it has an extremum."""
+    """r' of each belt up to sign, and r'' likewise where r' = 0; [belts] each."""
     if not has_clock(osc):  # x2'' = -x2 where x2' = 0
         return [osc.omega * a] * len(osc.belts), [osc.omega * x2] * len(osc.belts)
 
@@ -317,8 +318,7 @@ def _relative_motions(osc: Oscillator, mode: Mode, a: Array, x1: Array, x2: Arra
 
 
 class Graded(AbstractIntegrator):
-    """Steps of a stride over the `density` that the slip mode wants, as long as |x1| and |x2| are
-    < reach."""
+    """Steps of length stride / `density` of the slip mode, as long as |x1| and |x2| are < reach."""
 
     osc: Oscillator
     mode: Mode

@@ -10,7 +10,7 @@ from ..kernel.marks import time_back
 class RepeatedLoop(eqx.Module):
     """The loop that a run repeats: its arcs, by their numbers among those that were followed.
 
-    They are those from `first` to before `last`. Behind them the run passes the loop `loops` more
+    The loop's arcs are `first` to `last` - 1. After them the run passes the loop `loops` more
     times, which are not followed; then the arc `last` begins. loops = 0: there is no such loop.
     """
 
@@ -25,8 +25,8 @@ class RepeatedLoop(eqx.Module):
         return jnp.where(repeats, last, 0.0), jnp.where(repeats, last - first, 0.0)
 
     def total(self, counts: Array) -> Array:
-        """How many things there are in the whole run; counts: how many up to the end of each
-        followed arc."""
+        """Number of things, arcs or events, in the whole run; counts: their number up to the end of
+        each followed arc."""
         return counts[-1] + self.loops * self._in_loop(counts)
 
     def _in_loop(self, counts: Array) -> Array:
@@ -34,8 +34,8 @@ class RepeatedLoop(eqx.Module):
         return jnp.where(self.loops > 0, last - first, 0)
 
     def place(self, wanted: Array, counts: Array) -> tuple[Array, Array]:
-        """For the things of these numbers, from 1 on: the followed arcs in which they lie, and how
-        many periods later than there they happen; counts: see `total`."""
+        """For things with these numbers, from 1 on: indices of the followed arcs in which they lie,
+        and how many periods later than there they happen; counts: see `total`."""
         each = self._in_loop(counts)
         beyond = wanted - counts[jnp.maximum(self.last - 1, 0)]
         again = jnp.clip((beyond - 1) // jnp.maximum(each, 1) + 1, 0, self.loops)
@@ -45,6 +45,6 @@ class RepeatedLoop(eqx.Module):
         return jnp.minimum(rows, counts.size - 1), later
 
     def followed(self, ts: Array, event_t: Array) -> Array:
-        """The times ts; of those in loops that were not followed, the same moments in the one that
-        was."""
+        """The times ts, but times in loops that were not followed replaced by those at which the
+        followed loop is in the same state."""
         return ts - time_back(ts, self.loops, *self.end(event_t))

@@ -1,22 +1,22 @@
 """A run: the chain of arcs from its start to t1, or to where it ends before.
 
 In a slip arc the orbit runs in the smooth field of its mode until a guard of the mode vanishes; a
-stick arc is known in closed form. Who follows it depends on what is asked:
+stick arc is known in closed form. How the arcs are followed depends on what is asked:
 
-- a run by itself (`_alone`): a `lax.scan` of segments, an arc each, those of `arcs`, with slip arcs
+- a run by itself (`_alone`): a `lax.scan` of segments, one arc of `arcs` each, with slip arcs
   integrated by diffrax (`integrators.Adaptive`);
 - a batch, under `vmap` (`_together`): lanes of the kernel, see `batches` and `kernel.step`, at one
   tolerance for all, the smallest;
-- with a clock: a run by itself, of arcs of `timed`, and a batch as many of them;
-- derivatives (the rule of `arcs_of_run`): the arcs that are known, flown once more, see
+- with a clock: a run by itself, of arcs of `timed`; a batch is as many runs by themselves;
+- derivatives (the rule of `arcs_of_run`): the known arcs are integrated once more, see
   `sensitivities`.
 
 A loop that a run repeats is followed once, see `kernel.marks` and `loops`.
 
-The arcs of a run by itself end at extrema where a boundary or an
-edge is within reach, and else after the time MAX_ARC. So no root hides within a step: between two
-zeros of x2' lies a zero of x2, since x2'' = -x2 there, and two extrema of x2 in one step would take
-half a loop around a focus within it, which `MAX_ARC` and `MAX_FRACTION` exclude.
+The arcs of a run by itself end at extrema where a boundary or an edge is within reach, and else
+after the time MAX_ARC. So no root hides within a step: between two zeros of x2' lies a zero of x2,
+since x2'' = -x2 there, and two extrema of x2 in one step would take half a loop around a focus
+within it, which `MAX_ARC` and `MAX_FRACTION` exclude.
 """
 
 import functools
@@ -71,7 +71,7 @@ def _adaptive_slip_arc(osc, mode, signs, y, integrator) -> SlipArc:
 
 
 class RunState(eqx.Module):
-    """Where a run is: time, state, mode, the signs of x2' and x2, and how it stands."""
+    """Where a run is: time, state, mode, signs of x2' and x2, status, and whether it is done."""
 
     t: Array
     y: State
@@ -92,7 +92,7 @@ class RunState(eqx.Module):
 
 
 def _slip_segment(osc: Oscillator, state: RunState, t1, rtol, atol) -> tuple[ArcEnd, Array]:
-    """A slip arc; and whether the run ends at its end."""
+    """The next slip arc, and whether the run ends with it."""
     remaining = t1 - state.t
     span = jnp.minimum(remaining, MAX_ARC)
     integrator = Adaptive(osc, state.mode, span, SAFETY * rtol, SAFETY * atol)
@@ -113,7 +113,7 @@ def _stick_segment(osc: Oscillator, state: RunState, t1) -> tuple[ArcEnd, Array]
 
 
 class ArcRecord(eqx.Module):
-    """What a segment leaves behind: its arc, the event at its end, and what ended it.
+    """The record of a segment: its arc, the event at the arc's end, and what ended the arc.
 
     ended_by, in_time, captured: as in `flights.Arc`.
     """
@@ -165,7 +165,7 @@ def _timed_segment(osc: Oscillator, state: RunState, t1, rtol, atol):
 
 def _after_arc(state: RunState, end: ArcEnd, done: Array, t1) -> tuple[RunState, ArcRecord]:
     kind, belt = event_between(state.mode.codes, end.mode.codes)
-    # At t1 itself, where no event is before: the sum of the arcs may be short of it by rounding.
+    # A run that ends without an event ends at t1 itself: rounding may leave the sum of arcs short.
     t = jnp.where(done & (kind == 0), t1, state.t + end.duration)
     if len(end.y) == 3:
         end = replace(end, y=(*end.y[:2], t))
@@ -196,8 +196,8 @@ def _after_arc(state: RunState, end: ArcEnd, done: Array, t1) -> tuple[RunState,
 class Rules(NamedTuple):
     """What is fixed when runs are compiled.
 
-    max_segments: arcs of a run, at most; followed: those that are followed, without the loops that
-    are only repeated.
+    max_segments: largest number of arcs of a run; followed: largest number of arcs that are
+    followed, without those of loops that are only repeated.
     """
 
     max_segments: int
@@ -228,7 +228,7 @@ def _followed_arcs(
             new, record = _segment(osc, state, t1, rtol, atol)
             keep = functools.partial(jnp.where, state.done)
             if has_clock(osc):
-                # Forces do not repeat as the mass does.
+                # No search for a loop: the forces need not repeat when the mass does.
                 after = jax.tree.map(keep, state, new), repeat
                 return after, jax.tree.map(keep, blank, record)
             ended = replace(repeat, number=repeat.number + 1)
@@ -240,7 +240,7 @@ def _followed_arcs(
         # A true branch under vmap too: once every lane is done nothing more is computed.
         return lax.cond(any_lane(~state.done), advance, lambda: (carry, blank))
 
-    # In blocks, because stepping over what is left of the budget is not free.
+    # In blocks, because skipping the rest of the budget arc by arc is not free.
     length = min(BLOCK, rules.followed)
     blank = jax.tree.map(
         lambda leaf: jnp.broadcast_to(leaf, (length, *leaf.shape)),
@@ -288,8 +288,8 @@ def _together(lane, axis_size, batched, *args, rules: Rules):
 
 
 def _rows_together(lane, structure, flags, count: int, rules: Rules) -> Callable:
-    """`arcs_of_run` of so many rows, by the leaves of its arguments: rows where flagged, else the
-    same for all. A batch of it is so many more rows."""
+    """`arcs_of_run` of `count` rows, as a function of the leaves of its arguments: [rows, ..] where
+    flagged, else the same for all. Under `vmap` a batch becomes so many more rows."""
 
     def call(*leaves):
         batched = jax.tree.unflatten(structure, flags)
@@ -315,7 +315,7 @@ def _followed_rows(lane, axis_size: int, batched, args, rules: Rules):
     groups = -(-axis_size // width)
 
     def by_group(leaf):
-        # Lanes that are left over do nothing: they start nowhere.
+        # Spare lanes, which fill up the last group, start at NaN and do nothing.
         return in_groups_of(width, leaf, fill=jnp.nan)
 
     def spread(leaf, flag):
@@ -354,7 +354,7 @@ def _followed_rows(lane, axis_size: int, batched, args, rules: Rules):
 
 
 def _as_runs(group: Group, t0: Array, t1: Array, shapes) -> tuple[Any, Array]:
-    """The runs of a group as `arcs_of_run` gives them, [lanes, ..], and which to follow alone."""
+    """The runs of a group as `arcs_of_run` returns them, [lanes, ..], and which to follow alone."""
     lanes, arcs, used = group.lanes, group.arcs, group.used
 
     def column(name, blank):
@@ -369,7 +369,7 @@ def _as_runs(group: Group, t0: Array, t1: Array, shapes) -> tuple[Any, Array]:
     records = {name: column(name, getattr(blank, name)) for name in arcs}
     for name in ("t", "event_t"):
         records[name] = records[name] + t0[None]
-    # As in a run by itself: at t1 itself.
+    # As in a run by itself, an arc that ends the run in time ends at t1 itself.
     is_end = used & arcs["in_time"]
     records["event_t"] = jnp.where(is_end, t1[None], records["event_t"])
     records = ArcRecord(**{name: jnp.swapaxes(value, 0, 1) for name, value in records.items()})
@@ -432,8 +432,8 @@ def _(primals, tangents):
     ]
     inputs = in_one_row(*start, tangents[0])
     ends = sensitivities(varied, rest, arcs, t1 - records.t).along(inputs)
-    # The first entry moves as the start does, the others as the ends before them, behind the loop
-    # later by the periods that were not followed.
+    # The first entry varies as the start does, each other one as the end before it. After a loop,
+    # entries also vary by the periods that were not followed.
     late = again.astype(float) * (ends.t - ends.t[jnp.maximum(loop.first - 1, 0)])
     entries = jax.tree.map(
         lambda first, rows: jnp.append(first, rows[:-1]),
@@ -465,7 +465,7 @@ def _(primals, tangents):
 
 
 def _unused(belts: int, parts: int = 2) -> ArcRecord:
-    """The record of a segment that is not needed; parts: of a state, three with a clock."""
+    """The record of an unused segment; parts: numbers in a state, three with a clock."""
     nan, pair, none = jnp.full((), jnp.nan), jnp.full(parts, jnp.nan), jnp.zeros((), int)
     mode = jnp.zeros(belts, jnp.int8)
     return ArcRecord(
@@ -491,7 +491,7 @@ def states_at(
     samples: Array,
     ts: Array,
 ):
-    """States and modes at the times ts, with derivatives; samples: the states, without."""
+    """States and modes at the times ts, with derivatives; samples: these states, without."""
     arcs, numbers, since = arcs_at(records, loop.followed(ts, records.event_t))
     beyond = ts > final.t
     since = jnp.where(beyond, 0.0, since)
@@ -502,13 +502,13 @@ def states_at(
 
 
 def _afterwards(final: RunState) -> Array:
-    """The state past the end of the last arc: the run rests there, with a reason, or is unknown."""
+    """The state past the end of the last arc: the last one if the mass rests there, else NaN."""
     rests = (final.status == Status.PSEUDO_FOCUS) | (final.status == Status.STUCK_FOREVER)
     return jnp.where(rests, jnp.stack(final.y[:2]), jnp.nan)
 
 
 def state_at_end(final: RunState, records: ArcRecord, loop: RepeatedLoop, t1: Array):
-    """State and mode at t1, with derivatives: those that the last arc ends with."""
+    """State and mode at t1, with derivatives: those at the end of the last arc."""
     beyond = t1 > final.t
     arcs, *_ = arcs_at(records, loop.followed(t1[None], records.event_t))
     mode = jnp.where(beyond, stacked_codes(final.mode), arcs.mode[0])

@@ -26,7 +26,7 @@ def _slip_flow(osc, mode, y, integrator):
 
 
 def arcs_at(records, ts: Array) -> tuple[Any, Array, Array]:
-    """Of each time the arc that it lies in, its number, and the time since its entry.
+    """For each time the arc that it lies in, this arc's number, and the time since its entry.
 
     records: arcs as a tree of arrays [arcs, ..], among them t and duration, NaN where unused.
     """
@@ -49,7 +49,7 @@ def sampled(osc: Oscillator, records, ts: Array, rtol, atol) -> Array:
 
 
 def _flown_in_pieces(osc: Oscillator, rtol, atol, numbers, arcs, since, stuck) -> Array:
-    """The states at a time `since` the entries of arcs, [samples, 2]; numbers: of the arcs."""
+    """The states at times `since` the entries of arcs, [samples, 2]; numbers: those of the arcs."""
 
     def at(osc, rtol, atol, arc, since, stuck, goes_on, before, y):
         mode = Mode(tuple(arc.mode[j].astype(float) for j in range(len(osc.belts))))
@@ -63,8 +63,8 @@ def _flown_in_pieces(osc: Oscillator, rtol, atol, numbers, arcs, since, stuck) -
         moved = arc.y[0] + v * since, v
         return jnp.stack(select(stuck, moved, flown))
 
-    # As many pieces of the times as lanes. Each lane goes from one of its samples to the next, or
-    # from where the next one's arc begins; so, too, where under a trace the times do not increase.
+    # The times are cut into one piece per lane. A lane goes from each sample to its next one, or
+    # from the entry of the next one's arc; so, too, if under a trace the times do not increase.
     first = jnp.arange(since.size) % max(since.size // SAMPLED, 1) == 0
     before = jnp.roll(since, 1)
     goes_on = (numbers == jnp.roll(numbers, 1)) & (before <= since) & ~first

@@ -2,12 +2,13 @@
 
 Once the arcs of a run are known (entry, mode, duration, and what ended each) its derivatives need
 no search for events and no control of steps. Each arc is flown again by a fixed number of steps,
-many arcs at once, for its Jacobian: of its end and its duration, by its entry, by the time that is
-left, and by the parameters. Where a guard ended it, the duration follows from the guard (implicit
-function theorem). The sensitivities of all entries are then a linear recurrence over the arcs.
+many arcs at once, for its Jacobian: the derivatives of its end and its duration by its entry, by
+the time that is left, and by the parameters. Where a guard ended it, the duration follows from the
+guard (implicit function theorem). The sensitivities of all entries are then a linear recurrence
+over the arcs.
 
-The tangent of a run is its sensitivities times those of its inputs, a product that reverse mode
-transposes; so both modes, and any number of derivatives by one run, cost about the same.
+The tangent of a run is its sensitivities times the tangent of its inputs, a product that reverse
+mode transposes; so both modes, and any number of derivatives by one run, cost about the same.
 """
 
 from dataclasses import replace
@@ -66,7 +67,7 @@ class Sensitivity(eqx.Module):
 
 
 def _state_since(osc: Oscillator, arc: Arc, end: State, y: State, since: Array) -> State:
-    """The state a time after the entry y, in the mode of an arc, near its end.
+    """The state a time `since` after the entry y, in the mode of an arc, near its end.
 
     end: as `_flown_again` gives it.
     """
@@ -80,16 +81,16 @@ def _state_since(osc: Oscillator, arc: Arc, end: State, y: State, since: Array) 
 
 
 def _passed(osc: Oscillator, arc: Arc, end: State, y: State, remaining: Array) -> tuple[Array, ...]:
-    """Where the orbit goes on after an arc that is known, x1 and x2, and the arc's duration.
+    """Where the orbit goes on after a known arc, x1 and x2, and the arc's duration.
 
-    As functions of the oscillator, of the entry y, and of the time left, near those of the arc;
-    end: as `_flown_again` gives it.
+    All are functions of the oscillator, of the entry y, and of the time that is left, near those of
+    the arc; end: as `_flown_again` gives it.
     """
     if has_clock(osc):
         return _passed_in_time(osc, arc, end, y, remaining)
     mode = arc.mode
     stuck = mode.any_stuck
-    # The numbers of the run itself, so that the field is the same here and at the next entry.
+    # The values of the run itself, so that the field is the same here and at the next entry.
     end = _with_numbers_of(arc.end[0], end[0]), _with_numbers_of(arc.end[1], end[1])
 
     def fired_guard(x1, x2):
@@ -102,7 +103,7 @@ def _passed(osc: Oscillator, arc: Arc, end: State, y: State, remaining: Array) -
         ]
         return foremost(osc, same, guards, hit)
 
-    # By how much later than after `duration` the arc ends: nothing, with the right derivatives.
+    # How much later than after `duration` the arc ends: 0, with the right derivatives.
     slopes = slip_field(osc, mode, end)
     late = delay_of_root(fired_guard, end, slopes)
     late = jnp.where(arc.in_time, remaining - arc.duration, late)
@@ -124,7 +125,7 @@ def _timed(y: State) -> TimedState:
 
 
 def _later(osc: Oscillator, arc: Arc, y: TimedState, late: Array) -> TimedState:
-    """The state that little later, to first order."""
+    """The state a small time `late` later, to first order."""
     slopes = field_at(osc, arc.mode, y)
     x1, x2, t = (part + late * slope for part, slope in zip(y, slopes, strict=True))
     return x1, x2, t
@@ -133,7 +134,7 @@ def _later(osc: Oscillator, arc: Arc, y: TimedState, late: Array) -> TimedState:
 def _passed_in_time(
     osc: Oscillator, arc: Arc, end: State, y: State, remaining: Array
 ) -> tuple[Array, ...]:
-    """`_passed` with a clock: of a stick phase, too, the guard that ended it tells its duration."""
+    """`_passed` with a clock: the duration follows from the guard, for a stick phase, too."""
     mode = arc.mode
     found = _timed_end(osc, arc, end, y)
     x1, x2, t = (_with_numbers_of(a, b) for a, b in zip(_timed(arc.end), found, strict=True))
@@ -159,7 +160,7 @@ def _with_numbers_of(known: Array, found: Array) -> Array:
 def _creep(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> tuple[Array, Array, Array]:
     """Whether the mass slips but hardly moves, see `rest.is_slow`; and the field, (x2, x2')."""
     if has_clock(osc):
-        # Where a mass hardly moves for an instant, forces go on.
+        # With a clock the forces change even while the mass hardly moves: no state counts as slow.
         return mode.any_stuck & False, x2, x2
     _, a = slip_field(osc, mode, (x1, x2))
     return ~mode.any_stuck & is_slow(x2, a), x2, a
@@ -171,7 +172,7 @@ def parts_of_states(states: Array) -> State:
 
 
 def in_one_row(*slopes) -> Array:
-    """The numbers of some trees, one after the other."""
+    """The numbers of some trees in one array, one after the other."""
     return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(slopes)])
 
 
@@ -232,14 +233,14 @@ def _sensitivities(by_run, varied, rest, arcs: Arc, remaining: Array) -> Sensiti
 
 
 def _part(leaf: Array, *spans) -> Array:
-    """Of each of the first axes the part (first, how many)."""
+    """The slice (first, size) of each of the first axes of an array."""
     for axis, (first, size) in enumerate(spans):
         leaf = lax.dynamic_slice_in_dim(leaf, first, size, axis)
     return leaf
 
 
-#: Sensitivities of runs where they stand, and those of the time when the loop began, arrays [runs,
-#: inputs].
+#: Sensitivities of runs at the arc reached, and those of the time when the loop began, arrays
+#: [runs, inputs].
 Carry = tuple[Sensitivity, Array]
 
 
@@ -273,8 +274,8 @@ def _past_chunk(by_run, varied, rest, arcs: Arc, remaining, carry: Carry):
 
 @one_kernel
 def _past_rows(carry: Carry, rows):
-    """The sensitivities past some arcs, and at the end of each, [arcs, runs, inputs]; rows: of each
-    the derivatives, whether it was used, `_creep`, and what loop begins and ends behind it."""
+    """The sensitivities after some arcs, and at the end of each, [arcs, runs, inputs]; rows: for
+    each arc its derivatives, whether it is used, its `_creep`, and `begins_loop` and `again`."""
 
     def advance(carry, row):
         before, began = carry
@@ -321,9 +322,9 @@ def _made_safe(arcs: Arc) -> Arc:
 def with_derivatives(
     osc: Oscillator, entries: Array, since: Array, numbers: Array, codes: Array, states: Array
 ):
-    """The states, [samples, 2], with derivatives: each is reached in the mode of its codes,
-    [belts], in the arc of that number, from its entry, (x1, x2) or with a clock (x1, x2, t), after
-    a time since then."""
+    """The states, [samples, 2], with derivatives. Each is reached from the entry (x1, x2), with a
+    clock (x1, x2, t), of the arc with the number in `numbers`, in the mode `codes`, [belts], after
+    the time `since`."""
     return states
 
 
@@ -343,14 +344,14 @@ def _(primals, tangents):
     reached = states
     if d == 3:
         reached = jnp.concatenate([states, (entries[:, 2] + since)[:, None]], axis=1)
-    # Where the mass hardly moves, a later entry is as good as another start.
+    # While the mass hardly moves, a later entry time has the effect of another entry state.
     modes = mode_of(jnp.moveaxis(codes.astype(float), -1, 0))
     creeps, *field = _creep(osc, modes, entries[:, 0], entries[:, 1])
     earlier = jnp.where(creeps, since_along, 0.0)
     if d == 2:
         entries_along = entries_along + jnp.stack(field, axis=1) * earlier[:, None]
     since_along = since_along - earlier
-    # From the sample before, where it lies in the same arc: the way is shorter.
+    # From the sample before, if it lies in the same arc: the flight is shorter.
     before = jnp.roll(since, 1)
     goes_on = (numbers == jnp.roll(numbers, 1)) & (before <= since)
     goes_on = goes_on.at[0].set(False)

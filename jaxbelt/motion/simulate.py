@@ -241,8 +241,8 @@ def _smoothed(given, y0, t0, t1, ts, rtol, atol, *, width, formulation, resoluti
 def _filippov(
     given, y0, t0, t1, ts, rtol, atol, *, rules, max_events, resolution, ends_at_t1, last=None
 ) -> Trajectory:
-    """last: the number of the row that is the end of the run, where this is no part of the program
-    (-1: none)."""
+    """The trajectory of the exact formulation. last: number of the sample at the end of the run, -1
+    for none; given as data, so that it is no part of the program."""
     osc = in_units_of_run(given)
     y0 = y0 / osc.units.length
     atol = in_units(atol, osc.units.length, SIMULATION_TOLERANCE)
@@ -293,7 +293,7 @@ def _filippov(
                 jnp.where(unused[:, None], y1, arcs.y),
                 jnp.where(unused[:, None], mode1, arcs.mode),
             )
-            # Of loops that were not followed they may be out of order by a rounding.
+            # Entries in loops that were not followed may be out of order by a rounding.
             order = _merged(wanted_times, lax.cummax(lax.stop_gradient(entries[0])))
             rows = jax.tree.map(lambda *both: jnp.concatenate(both)[order], rows, entries)
         ends = t1, y1, mode1
@@ -303,12 +303,12 @@ def _filippov(
 
 
 def _without_clock(states: Array) -> Array:
-    """States [rows, 2], of those with a clock without it."""
+    """The states (x1, x2), [rows, 2], without the time that states with a clock have."""
     return states if states.shape[1] == 2 else states[:, :2]
 
 
 def _merged(first: Array, second: Array) -> Array:
-    """The numbers of the rows of both in order; each of them is in order already."""
+    """Indices that sort the concatenation of two arrays, each of which is sorted already."""
     places = [
         jnp.arange(rows.size) + jnp.searchsorted(others, rows, side=side).astype(int)
         for rows, others, side in ((first, second, "left"), (second, first, "right"))
@@ -354,8 +354,8 @@ def simulate(
     Args:
         osc: The oscillator.
         y0: Start (x1, x2), dimensionless, shape [2].
-        t1: End of the time span in dimensionless time tau = omega t, that of the cosines where
-            there is forcing.
+        t1: End of the time span in dimensionless time tau = omega t, the time of which forces,
+            velocities and loads are functions.
         t0: Beginning of the time span.
         ts: Sample times, increasing, shape [n]; None: an even grid with the ends of all arcs in it,
             and t1 last. For the reverse mode of a function of the final state alone give ts=[t1];
@@ -397,7 +397,7 @@ def simulate(
         expected = f'left out unless formulation="{of}"'
         require(width is None or formulation == of, name, expected, width)
     width, name = (v_star, "v_star") if formulation == "switch" else (eps, "eps")
-    # Those that are left out become NaN.
+    # Sizes that are left out become NaN.
     sizes = [rtol, *(one for one in (atol, width) if one is not None)]
     atol, width = as_size(atol, "atol"), as_size(width, name)
     padded = not is_concrete((osc, y0, t0, t1, ts, *sizes))
@@ -435,7 +435,7 @@ def simulate(
 
 
 def _are_possible(t0: Any, t1: Any, ts: Any, sizes: list[Any]) -> Array:
-    """Whether traced arguments are such that known ones would not raise.
+    """Whether traced arguments are possible: values for which known ones would not raise.
 
     sizes: tolerances and widths that are given.
     """
@@ -449,7 +449,7 @@ def _are_possible(t0: Any, t1: Any, ts: Any, sizes: list[Any]) -> Array:
 
 
 def _busyness(osc: Oscillator) -> float:
-    """How many times as many arcs there may be as without a clock, by its fastest wave."""
+    """Factor by which a clock may multiply the number of arcs, from its fastest wave."""
     if not has_clock(osc):
         return 1.0
     if not is_concrete(osc):
@@ -503,12 +503,12 @@ def _room_for(value: float, least: int) -> int:
     return power_of_two(math.ceil(min(value, 2.0**20)), least)
 
 
-#: Fewest rows of samples; rows are computed in so many lanes.
+#: Fewest rows of samples, the number of lanes in which rows are computed.
 FEWEST_SAMPLES = 32
 
 
 def _rows_for(samples: int) -> int:
-    """Rows that are computed for so many wanted times, so that few programs are compiled."""
+    """Number of rows to compute for this many sample times, rounded up to share few programs."""
     room = power_of_two(samples, FEWEST_SAMPLES)
     less = 3 * room // 4
     return less if samples <= less and less % FEWEST_SAMPLES == 0 else room
@@ -539,6 +539,6 @@ def _without_padding(
         wanted = rows(wanted, np.flatnonzero(np.diff(known.ts, prepend=-np.inf)))
     events = rows(known.events, np.flatnonzero(known.events.kind))
     arcs = rows(known.arcs, np.flatnonzero(~np.isnan(known.arcs.t)))
-    # Put there as they are: jnp.asarray compiles a program for every shape.
+    # By device_put, because jnp.asarray compiles a program for every shape.
     (ts, ys, modes), events, arcs = jax.device_put((wanted, events, arcs))
     return Trajectory(ts, ys, modes, events, arcs, trajectory.status)

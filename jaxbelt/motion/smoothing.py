@@ -7,7 +7,7 @@ creeps. Both are plain vector fields of the state; as v_star and eps go to zero 
 exact motion at first order. They are integrated without events, and piece by piece where there are
 contact edges: within a piece the contacts stay as they are, so that no interval is jumped and
 derivatives have the jumps at edges. At its band the switch field is discontinuous as well, and
-derivatives through its integration lack the jumps there: take them from the exact one.
+derivatives through its integration lack the jumps there: take them from the exact motion.
 """
 
 import functools
@@ -42,20 +42,20 @@ from .arcs import Ends, arc_to_guard
 from .integrators import AbstractIntegrator, LastStep, State
 from .runs import SAFETY
 
-#: Steps between two samples before a run is given up.
+#: Largest number of steps between two samples; then a run is given up.
 MAX_STEPS_A_SAMPLE = 1_000_000
 #: Longest piece between two edges, times the highest frequency; longer ones are cut. Longest and
-#: first step, as fractions of it.
+#: first step of a piece, as fractions of it.
 LONGEST_PIECE, LONGEST_OF_PIECE, FIRST_OF_PIECE = 1.0, 0.5, 0.2
-#: Pieces that end at an edge or an extremum, beyond so many per unit of time, before a run between
-#: two samples is given up: it may pass an edge ever faster.
+#: Between two samples, number of pieces that end at an edge or an extremum, beyond
+#: ENDED_PIECES_RATE per unit of time, before a run is given up: it may pass an edge ever faster.
 MAX_ENDED_PIECES, ENDED_PIECES_RATE = 5_000, 100.0
 
 
 def switch_mode(
     osc: Oscillator, x1: Array, x2: Array, v_star: Array, contacts: Mode | None = None
 ) -> Mode:
-    """The mode of the switch model at a state: belts of the band that holds have code 0.
+    """The mode of the switch model at a state: code 0 for the belts in whose band the mass is held.
 
     Where the bands of two belts overlap, the first belt that can hold wins; belts of one velocity
     hold together. contacts: which belts touch; None: those at x1.
@@ -172,8 +172,8 @@ def _tsit5() -> Any:
 class _Tsit5(AbstractIntegrator):
     """Steps of `_tsit5` for the time `span`; scalars.
 
-    Its last stage is at the end of a step, so that it sees there where the field jumps, as it does
-    at the band of the switch model.
+    The last stage of Tsit5 is at the end of a step, so that it notices a jump of the field there,
+    as at the band of the switch model.
     """
 
     span: Array
@@ -186,7 +186,7 @@ class _Tsit5(AbstractIntegrator):
         def ends_outside(t, y, args, **kwargs):
             return (t > 0) & is_outside(y)
 
-        # As the field may jump, only the last step depends on the span, by where it ends.
+        # As the field may jump, only the last step may depend on the span, by where it ends.
         span = lax.stop_gradient(self.span)
         solution = dfx.diffeqsolve(
             dfx.ODETerm(lambda t, y, args: field(y)),
@@ -222,14 +222,14 @@ def _codes_of(mode: Mode, signs: tuple[Array, ...]) -> Codes:
 
 
 def _signs(rates: State, default: Array) -> tuple[Array, Array]:
-    """Signs of x2' and of x1'; where x1' is 0 it gets that of x2', where that is, the default."""
+    """Signs of x2' and x1'. If x2' = 0, its sign is `default`; if x1' = 0, it gets that of x2'."""
     of_x1, of_x2 = map(jnp.sign, rates[:2])
     of_x2 = jnp.where(of_x2 == 0, default, of_x2)
     return of_x2, jnp.where(of_x1 == 0, of_x2, of_x1)
 
 
 def _codes_at_start(field: Callable, osc: Oscillator, width: Array, y: State) -> Codes:
-    """Contacts and signs at the start; an edge there is on the side that the motion comes from."""
+    """Contacts and signs at the start; an edge there counts as passed in the motion's direction."""
     now = at_time(osc, *y[2:]) if has_clock(osc) else osc
     right, left = (contact(now, *y[:2], rightward=rightward) for rightward in (True, False))
     one = jnp.ones_like(y[0])
@@ -258,7 +258,7 @@ def _piece(field, osc: Oscillator, width, y: State, codes: Codes, span, rtol, at
             [*no_boundaries, *edge_guards(osc, mode, y[0]), signs[0] * a, signs[1] * v]
         )
 
-    # With a clock an extremum may be near however fast the mass is.
+    # With a clock an extremum may be near however fast the mass is, so every one ends a piece.
     every = has_clock(osc)
     integrator = _Tsit5(span, SAFETY * rtol, SAFETY * atol)
     arc = arc_to_guard(osc, mode, signs, motion, guards, y, integrator, every_extremum=every)
@@ -285,7 +285,7 @@ def _piece(field, osc: Oscillator, width, y: State, codes: Codes, span, rtol, at
 
 @forward_jacobian
 def _flow_past_edges(field, osc, width, y, codes, duration, rtol, atol):
-    """The state and the codes after a time, NaN where the integrator or the budget ended it."""
+    """The state and the codes after a time, NaN where the integrator or the budget gave out."""
     longest = lax.stop_gradient(LONGEST_PIECE / fastest(osc))
 
     def unfinished(state):
@@ -318,7 +318,7 @@ def integrate(field, osc: Oscillator, width: Array, y0, t0, ts, rtol, atol) -> A
 
     def advance(carry, t):
         now, y, codes = carry
-        # What is not a number would reject every step, and keep a batch waiting.
+        # With NaN or inf every step would be rejected, which keeps a batch waiting.
         goes = known & jnp.isfinite(y[0]) & jnp.isfinite(y[1])
         duration = jnp.where(goes, t - now, 0.0)
         if edges:

@@ -1,18 +1,18 @@
 """One arc with a clock: from a state to the first guard that vanishes, and how it goes on there.
 
 Without a clock the extrema of x2 and of x1 tell how often a guard can vanish, see `arcs`; with one
-they do not: x2'' is not -x2 where x2' = 0, and boundaries move. So each step has to show that none
-of its guards vanishes within, by what all guards are at its ends: value, slope and curvature along
-the motion, by derivatives of the field. A quintic has these values; in the basis of Bernstein it
-lies within its six control points. Where these, less the error of the quintic, are positive, the
-guard is. Where the guard is negative at the end and the control points fall, it has one root.
+they do not: x2'' is not -x2 where x2' = 0, and boundaries move. So each step has to prove that none
+of its guards vanishes within, from the guards at both ends: value, slope and curvature along the
+motion, by derivatives of the field. A quintic has these values; in the basis of Bernstein it lies
+within its six control points. Where these, less the error of the quintic, are positive, the guard
+is positive. Where the guard is negative at the end and the control points fall, it has one root.
 Otherwise the step is halved. The error of the quintic is at most |g(6)| h^6/46080, g(n) being the
-derivative of order n. Its control points are |g(4)| h^4/240 away from those of the cubic with the
-same values and slopes, and a quarter of that, `QUINTIC_SHARE`, is taken for its error: for a wave
-of frequency Omega it is 48 over (Omega h)^2 times as much, and no step is longer than half a radian
-of the fastest wave. Slip and stick phases are proved in the same way; in stick phases the state is
-in closed form. A double root, where control points are negative by rounding only, is touched, and
-the arc goes on.
+derivative of order n of a guard. The control points of the quintic are |g(4)| h^4/240 away from
+those of the cubic with the same values and slopes, and a quarter of that, `QUINTIC_SHARE`, is taken
+for the error: for a wave of frequency Omega it is 48 over (Omega h)^2 times as much, and no step is
+longer than half a radian of the fastest wave. Slip and stick phases are proved in the same way; in
+stick phases the state is in closed form. A double root, where control points are negative by
+rounding only, is touched, and the arc goes on.
 """
 
 import functools
@@ -43,9 +43,9 @@ from ..numerics.implicit import step_to_root
 from ..numerics.roots import first_root
 from .arcs import ArcEnd
 
-#: Longest step, times the highest frequency; the first one of an arc.
+#: Longest step, times the highest frequency; first step of an arc, over the longest one.
 LONGEST_OF_WAVE, FIRST_OF_WAVE = 0.5, 0.05
-#: Steps are not halved below this; what is not decided there is rounding.
+#: Steps are not halved below this; whether a guard vanishes in so short a step is rounding.
 SHORTEST_STEP = 1e-8
 #: Part of the distance between cubic and quintic that bounds the error of the quintic.
 QUINTIC_SHARE = 0.25
@@ -54,7 +54,7 @@ TOUCH = 0.1 * GUARD_ROUNDING
 #: Newton steps for the root beside a zero at which an arc began; and the shortest such arc, times
 #: `blur` of the time, at whose end the guard falls beyond rounding.
 STEPS_BESIDE_ZERO, SHORTEST_BESIDE_ZERO = 6, 1e-11
-#: Steps before an arc is given up.
+#: Largest number of steps of an arc; then it is given up.
 MOST_TIMED_STEPS = 20_000
 #: Longest slip arc; longer ones are cut.
 LONGEST_TIMED_ARC = 1.0
@@ -62,8 +62,8 @@ _BOTH_ORDERS, _BESIDE_ZERO = scheme((2, 4, 6, 8), (2, 4, 6)), scheme((2, 4), (2,
 
 
 class _March(NamedTuple):
-    """Where a march is: the time passed, the state, guards there and what is added to those that
-    began at zero; the next step. hit: a guard vanishes within that step, which is then its length.
+    """Where a march is: the time passed, the state, the guards there, shifts that are added to
+    guards that began at zero, and the next step h. hit: a guard vanishes within this next step.
     """
 
     passed: Array
@@ -94,7 +94,7 @@ def _control_points(at: Trend, end: Trend, h: Array) -> tuple[Array, Array]:
     b += [at.value + 0.4 * h * at.slope + 0.05 * h**2 * at.curvature]
     b += [end.value - 0.4 * h * end.slope + 0.05 * h**2 * end.curvature]
     b += [end.value - 0.2 * h * end.slope, end.value]
-    # Those of the cubic in the middle.
+    # The two middle control points of the cubic, raised to degree five.
     p = [at.value, at.value + h * at.slope / 3, end.value - h * end.slope / 3, end.value]
     third = (p[0] + 6 * p[1] + 3 * p[2]) / 10
     fourth = (3 * p[1] + 6 * p[2] + p[3]) / 10
@@ -103,7 +103,7 @@ def _control_points(at: Trend, end: Trend, h: Array) -> tuple[Array, Array]:
 
 
 def _finite(at: Trend) -> Trend:
-    """Guards that are not there as ones that stay positive."""
+    """The trend of guards, with guards that do not exist (inf) replaced by ones that stay at 1."""
     there = jnp.isfinite(at.value)
     return Trend(
         jnp.where(jnp.isposinf(at.value), 1.0, at.value),
@@ -117,7 +117,7 @@ def first_vanishing(osc: Oscillator, mode: Mode, y: TimedState, longest: Array, 
 
     Returns its duration, its end, the number of the guard in `guards_at` or -1, and whether it was
     given up. A slip arc also ends, with -1, behind a minimum of the distance to a boundary, where
-    friction bends most: so that arcs have one bend, at an end.
+    friction bends most, so that each arc bends most at one of its ends.
     """
     n = len(osc.belts)
     most = LONGEST_OF_WAVE / fastest(osc)
@@ -140,7 +140,7 @@ def first_vanishing(osc: Oscillator, mode: Mode, y: TimedState, longest: Array, 
         terms = [e / (atol + rtol * size) for e, size in zip(errors, larger, strict=True)]
         error = functools.reduce(jnp.maximum, terms)
         accurate = (error <= 1) | (h <= SHORTEST_STEP) & jnp.isfinite(error)
-        # Whether guards vanish within the step.
+        # Prove whether guards vanish within the step.
         shifted = state.at.value + state.shifts, end.value + state.shifts
         points, astray = _control_points(
             state.at._replace(value=shifted[0]), end._replace(value=shifted[1]), h
@@ -198,8 +198,8 @@ def first_vanishing(osc: Oscillator, mode: Mode, y: TimedState, longest: Array, 
     y_end, _ = _stepped(osc, mode, last.y, h)
     y_end = select(last.hit, y_end, last.y)
     failed = last.failed | (last.steps >= MOST_TIMED_STEPS)
-    # Beside a zero at which the arc began a guard's value is rounding all the time, its slope is
-    # not: where the guard vanishes again its mean slope does, here that of a cubic.
+    # Beside a zero at which the arc began a guard's value is only rounding, but its slope is not:
+    # the guard vanishes again where its mean slope vanishes, taken here from a cubic.
     beside = (number >= 0) & (last.shifts[number] > 0)
     longest = last.passed + h
     shortest = jnp.minimum(SHORTEST_BESIDE_ZERO * blur(y[2]), longest)
@@ -223,7 +223,7 @@ def first_vanishing(osc: Oscillator, mode: Mode, y: TimedState, longest: Array, 
 
 
 class TimedArc(eqx.Module):
-    """How an arc ends, and whether the run ends with it: as `arcs.ArcEnd`."""
+    """end: how an arc ends and how the orbit goes on; done: whether the run ends with it."""
 
     end: ArcEnd
     done: Array
@@ -234,7 +234,7 @@ def timed_arc(osc: Oscillator, mode: Mode, y: TimedState, t1: Array, rtol, atol)
     stuck = mode.any_stuck
     remaining = t1 - y[2]
     forever = stuck & is_held_for_ever(osc, mode, y)
-    # Cut where slip arcs are followed once more for their derivatives.
+    # Slip arcs are cut, because they are integrated once more for their derivatives.
     longest = jnp.where(stuck, remaining, jnp.minimum(remaining, LONGEST_TIMED_ARC))
     looked = jnp.where(forever, 0.0, longest)
     duration, y_end, number, failed = first_vanishing(osc, mode, y, looked, rtol, atol)

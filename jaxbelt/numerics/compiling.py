@@ -1,14 +1,14 @@
-"""All that leans on what JAX, XLA and Equinox do not promise, behind one switch.
+"""Everything that relies on what JAX, XLA and Equinox do not document, behind one switch.
 
 - `jit`, `traced_once` and `each` save time of compiling; `one_kernel`, `one_kernel_alone`,
   `lanes_in_one_kernel`, `with_batches`, `wide`, `any_lane` and `where_any` save time of running.
-- What `jit` and `wide` compile is kept on disk by `programs`, which uses what is not promised, too.
+- `programs` keeps on disk what `jit` and `wide` compile; it uses undocumented features, too.
 - `depends` and `is_affine` look at what a function does with its arguments.
 - `require_own_threads` looks at whether JAX was in use before a process was forked.
 
-With JAXBELT_PLAIN=1 in the environment nothing unpromised is used, and everything works, slower.
-Without it, each of these ways is tried on a small example before its first use. One that fails is
-left out from then on, with a warning.
+With JAXBELT_PLAIN=1 in the environment ("plain" below) no undocumented feature is used; everything
+works, slower. Without it, each feature is tried on a small example before its first use. One that
+fails is left out from then on, with a warning.
 """
 
 import contextlib
@@ -32,7 +32,7 @@ from jax.core import Tracer
 from . import programs, usercode
 from .widths import SideBySide, is_cpu
 
-#: Whether to use only what is promised.
+#: Whether to use documented features only.
 PLAIN = os.environ.get("JAXBELT_PLAIN", "0") not in ("", "0")
 
 _works: dict[str, bool] = {}
@@ -40,7 +40,7 @@ _trying = threading.RLock()
 
 
 def _usable(name: str, trial: Callable[[], bool]) -> bool:
-    """Whether something unpromised may be used: it passed its trial, which is run once."""
+    """Whether an undocumented feature may be used: it passed its trial, which is run once."""
     if PLAIN:
         return False
     if name not in _works:
@@ -52,14 +52,14 @@ def _usable(name: str, trial: Callable[[], bool]) -> bool:
 
 def _try(name: str, trial: Callable[[], bool]) -> None:
     try:
-        # Now, also where the first use is inside of a trace: those of JAX belong to their thread.
+        # In another thread the trial is outside of any trace: JAX's traces belong to their thread.
         with ThreadPoolExecutor(1) as apart:
             _works[name] = apart.submit(trial).result()
         reason = "its result is wrong"
     except Exception as error:
         _works[name] = False
         reason = f"{type(error).__name__}: {error}"
-    # As the process ends nothing can be tried any more, and nobody waits for it.
+    # As the process ends every trial fails, and a warning is of no use.
     if not _works[name] and threading.main_thread().is_alive():
         warnings.warn(
             f"jaxbelt goes on without {name}, which does not work with JAX {jax.__version__} here "
@@ -108,7 +108,7 @@ def known(options: dict[str, Any]) -> dict[str, Any] | None:
 
 @jax.jit
 def _probe() -> Any:
-    """Known outside of a trace, and traced inside."""
+    """A number, concrete outside of a trace and a tracer inside."""
     return 0
 
 
@@ -120,7 +120,7 @@ def is_outermost(*values: Any) -> bool:
 def jit(function: Callable) -> Any:
     """`equinox.filter_jit`, compiled with the options `QUICK` and kept on disk, see `programs`.
 
-    Inside of another trace, where JAX takes no options, without them.
+    Inside of another trace, where JAX takes no options, it is compiled without them.
     """
     filter_jit: Any = eqx.filter_jit
     plain = filter_jit(function)
@@ -168,27 +168,27 @@ def wide(function: Callable) -> Any:
     return call
 
 
-#: Programs of one function that are known in memory, before all of them are forgotten.
+#: Most programs of one function in memory; before one more, all of them are forgotten.
 MOST_PROGRAMS = 4096
 
 
 class _Kept:
     """The programs of a function, which are kept on disk.
 
-    is_array: which leaves of the arguments are numbers, the rest is part of the program; options:
-    gives the compiler's.
+    is_array: whether a leaf of the arguments is an array; other leaves are part of the program;
+    options: gives the options of the compiler.
     """
 
     def __init__(self, function: Callable, is_array: Callable[[Any], bool], options: Callable):
         self.function, self.is_array, self.options = function, is_array, options
-        #: By what they are called with, and by what they are made of.
+        #: Programs by the structure and types of their arguments, and by `programs.key_of`.
         self.called: dict[Any, programs.KeptProgram | None] = {}
         self.made: dict[str, programs.KeptProgram] = {}
         self.locks: dict[Any, Any] = {}
         usercode.forgotten_with_programs(self.called.clear)
 
     def program(self, leaves: list[Any], structure: Any) -> tuple[Any, list[Any]]:
-        """The program of these arguments, and the arrays among them; None: it cannot be kept."""
+        """The program of these arguments, None if it cannot be kept; and the arrays among them."""
         arrays, signatures = [], []
         if PLAIN or not programs.are_kept():
             return None, arrays
@@ -236,14 +236,14 @@ class _Kept:
         return self.made[key]
 
 
-#: What `compiled_beside` was asked for in this process.
+#: The names and structures for which `compiled_beside` has begun calls in this process.
 _begun_beside: set[Any] = set()
 
 
 @contextlib.contextmanager
 def compiled_beside(name: str, like: Any, calls: Iterable[Callable[[], Any]]) -> Iterator[None]:
-    """While the block runs a second thread makes the calls, for the programs that they compile or
-    load; XLA compiles two programs side by side in two thirds of the time.
+    """While the block runs a second thread makes the calls, so that their programs are compiled or
+    loaded; XLA compiles two programs side by side in two thirds of the time.
 
     Once in a process for each name and structure of the tree `like`. What the calls return or raise
     is ignored; at the end of the block those that have not begun are left out. Only where programs
@@ -278,7 +278,7 @@ def _has_wide_vectors() -> bool:
 
 
 def traced_once(function: Callable) -> Any:
-    """The function itself, for functions that stand in many places: its trace is kept."""
+    """The same function, its trace kept: for functions that are called at many places."""
     filter_jit: Any = eqx.filter_jit
     return filter_jit(function) if PLAIN else filter_jit(function, inline=True)
 
@@ -286,7 +286,8 @@ def traced_once(function: Callable) -> Any:
 def _traced_once_anywhere(function: Callable) -> Callable:
     """The same function of arrays; its trace is kept.
 
-    JAX keeps traces by the mesh, and it is none outside of rules and an empty one inside.
+    JAX keeps traces by the mesh, which is unset outside of custom rules and empty inside them. Here
+    an unset mesh is replaced by an empty one, so that one trace serves both.
     """
     kept = jax.jit(function)
 
@@ -327,8 +328,8 @@ def _is_array(leaf: Any) -> bool:
 
 
 def of_lane(function: Callable, batched, args) -> tuple[Callable, list[Any]]:
-    """A function of the leaves that are batched, a list, and all of these: what the function gives
-    for one lane."""
+    """The function for one lane, as a function of the list of its batched leaves; and the list of
+    these leaves with all lanes."""
     leaves, structure = jax.tree.flatten(args)
     flags = jax.tree.leaves(batched)
 
@@ -341,12 +342,12 @@ def of_lane(function: Callable, batched, args) -> tuple[Callable, list[Any]]:
 
 
 def with_batches(function: Callable, batch: Callable) -> Callable:
-    """The same function of arrays, that closes over none; a batch of it is what
-    batch(function, axis_size, batched, *args) gives.
+    """The same function of arrays, that closes over none; a batch of it is computed by
+    batch(function, axis_size, batched, *args).
 
-    batched: a tree of flags like args. Derivatives of batches are as they were.
+    batched: a tree of flags like args. Derivatives of a batch are those of the plain `vmap`.
     """
-    # It stands in the batch, too, and in its derivatives.
+    # The batch and its derivatives contain the function, too: it is traced once for all.
     function = _traced_once_anywhere(function)
     lanes = _as_lanes(function, batch)
 
@@ -374,7 +375,7 @@ def lanes_in_one_kernel(function: Callable) -> Callable:
 
 
 def one_kernel_alone(function: Callable) -> Callable:
-    """`one_kernel`, whose batch is what the function makes of one: pieces of its own, say."""
+    """`one_kernel`, but a batch is the function under `vmap`, with any kernels inside of it."""
 
     def batch(_, axis_size, batched, *args):
         return jax.vmap(function, axes_of(tuple(batched)), axis_size=axis_size)(*args)
@@ -383,11 +384,11 @@ def one_kernel_alone(function: Callable) -> Callable:
 
 
 def axes_of(flags):
-    """For `jax.vmap`: the first axis of what is flagged; the rest is the same for all."""
+    """`in_axes` of `jax.vmap`: the first axis where flagged; the rest is the same for all lanes."""
     return jax.tree.map(lambda flag: 0 if flag else None, flags)
 
 
-#: Lanes of a group.
+#: Lanes of a group, see `in_groups`.
 GROUP = SideBySide(on_cpu=64, elsewhere=2**15)
 #: So many lanes, or fewer, are not worth the longer compilation of a group.
 FEW_LANES = 8
@@ -395,7 +396,7 @@ FEW_LANES = 8
 
 def in_groups(function: Callable) -> Callable:
     """The same function of arrays, that closes over none; a batch of it is done in groups of lanes,
-    one after another. Without derivatives."""
+    one after another. Its derivatives are not in groups."""
 
     def batch(_, axis_size, batched, *args):
         lane, leaves = of_lane(function, batched, args)
@@ -405,7 +406,7 @@ def in_groups(function: Callable) -> Callable:
         if axis_size <= size:
             return jax.vmap(lane)(leaves)
         groups = -(-axis_size // size)
-        # The last one is filled with its last lane.
+        # The last group is filled up with the last lane.
         lanes = np.minimum(np.arange(groups * size), axis_size - 1).reshape(groups, size)
         done = lax.map(lambda own: jax.vmap(lane)([leaf[own] for leaf in leaves]), lanes)
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:axis_size], done)
@@ -414,8 +415,8 @@ def in_groups(function: Callable) -> Callable:
 
 
 def more_rows(size: int, rows: int, leaf: jax.Array, is_row: bool, is_batched: bool) -> jax.Array:
-    """A leaf of a batch of `size`, each with so many rows, as rows of one; as it is where it is the
-    same for all."""
+    """A leaf of a batch, [size, rows, ..], as [size * rows, ..]; is_row: it has an axis of rows,
+    is_batched: one of the batch; with neither axis it stays as it is."""
     if is_batched and not is_row:
         return jnp.repeat(leaf, rows, axis=0)
     if is_row and not is_batched:
@@ -457,10 +458,10 @@ def _try_lanes() -> bool:
 #: Options that make XLA's CPU compiler put a call into one piece of machine code, and not dissolve
 #: it before. It does so without them for loops on less than a kilobyte.
 IN_ONE_PIECE = {"xla_cpu_small_call": "true", "inlineable": "false"}
-#: What is inside of the call would inherit the mark.
+#: Options of what is inside of the call, which would inherit `IN_ONE_PIECE`.
 NOT_MARKED = {"xla_cpu_small_call": "false", "inlineable": "true"}
-#: Operations that XLA can do there, those of Equinox's loops among them. It cannot sort, nor write
-#: to places that differ in a batch, nor call libraries.
+#: Operations that XLA can do in one piece, those of Equinox's loops among them. It cannot sort, nor
+#: write to places that differ in a batch, nor call libraries.
 POSSIBLE = frozenset(
     """abs acos acosh add add_any and argmax argmin asin asinh atan atan2 atanh broadcast_in_dim
     cbrt ceil clamp concatenate cond convert_element_type copy cos cosh cumsum custom_jvp_call
@@ -470,20 +471,20 @@ POSSIBLE = frozenset(
     rem remat2 reshape rev round rsqrt scan select_if_vmap select_n sign sin sinh slice sqrt
     square squeeze stack stop_gradient sub tan tanh transpose unvmap_any while xor""".split()
 )
-#: Largest array there. XLA computes large loops on several threads, which fails inside one piece
-#: (seen at 4,096 numbers, not at 3,000). There are pieces on the CPU only.
+#: Largest array in a piece. XLA computes large loops on several threads, which fails inside one
+#: piece (seen at 4,096 numbers, not at 3,000). There are pieces on the CPU only.
 LARGEST = SideBySide(on_cpu=1024, elsewhere=2**30)
 
-#: Whether what is traced becomes part of a piece already.
+#: Whether the function that is being traced is part of a piece already.
 _is_part = contextvars.ContextVar("is_part", default=False)
 
 
 def one_kernel(function: Callable) -> Callable:
     """The same function of arrays, that closes over none; on the CPU as one piece of machine code.
 
-    Else XLA's runtime calls a piece of code for every few operations, every time round a loop, and
-    for a few numbers that takes longer than the operations do. In a batch, in derivatives, and
-    where something in it is not possible in one piece, the function is as it was.
+    Otherwise XLA's runtime calls a piece of code for every few operations, every time round a loop,
+    and for a few numbers that takes longer than the operations do. In a batch, in derivatives, and
+    where an operation is not possible in one piece, the function is compiled as usual.
     """
     function = _traced_once_anywhere(function)
     piece = _as_piece(function)
@@ -530,7 +531,7 @@ def _is_possible(jaxpr: Any) -> bool:
 
 
 def _in_one_piece(jaxpr: Any, *args) -> list[jax.Array]:
-    """What the jaxpr gives, as one piece of machine code where it is not in a batch."""
+    """The results of the jaxpr, computed in one piece of machine code, but as usual in a batch."""
     # Imported late: `_try_piece` detects a version of JAX that lacks them.
     from jax.experimental.xla_metadata import set_xla_metadata
     from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
@@ -541,13 +542,13 @@ def _in_one_piece(jaxpr: Any, *args) -> list[jax.Array]:
     @jax.jit
     def unmarked(*args):
         with set_xla_metadata(**NOT_MARKED):
-            # Handed through: XLA fails where an argument is not used,
+            # The arguments are returned, too: XLA fails where one of them is not used.
             return evaluate(*args), args
 
     @jax.custom_batching.custom_vmap
     def alone(*args):
         with set_xla_metadata(**IN_ONE_PIECE):
-            # or is a constant, which the barrier hides from it.
+            # XLA also fails where an argument is a constant: the barrier hides that it is.
             return unmarked(*lax.optimization_barrier(args))[0]
 
     @alone.def_vmap
@@ -578,8 +579,8 @@ def _try_piece() -> bool:
 def any_lane(flag: jax.Array) -> jax.Array:
     """Whether a flag holds anywhere in a batch, one answer for all lanes.
 
-    With it `lax.cond` has one branch under `vmap`, too. Plain: the lane's own flag, and both
-    branches are computed in a batch.
+    With it `lax.cond` computes only one branch under `vmap`, too. Plain: the lane's own flag, and
+    both branches are computed in a batch.
     """
 
     def trial():
@@ -596,12 +597,11 @@ def any_lane(flag: jax.Array) -> jax.Array:
 
 
 def where_any(flags: jax.Array, function: Callable[[], Any], otherwise: Any) -> Any:
-    """What the function gives where any of the flags is set, in any lane; else `otherwise`, a tree
-    of the same shapes. For what few lanes need, and seldom.
+    """function() if any of the flags is set, in any lane; else `otherwise`, a tree of the same
+    shapes. For results that few lanes need, and seldom.
 
-    On accelerators always what the function gives: of so many lanes there are some that need it,
-    and the device would wait for the host to choose the branch. So lanes without the flag may hold
-    either.
+    On accelerators always function(): of so many lanes some need it, and the device would wait for
+    the host to choose the branch. So lanes without the flag may hold either result.
     """
     if not is_cpu():
         return function()
@@ -609,7 +609,7 @@ def where_any(flags: jax.Array, function: Callable[[], Any], otherwise: Any) -> 
 
 
 def depends(function: Callable, *args: Any) -> tuple[bool, ...]:
-    """For each leaf of what a function gives, whether it depends on its arguments, numbers.
+    """For each leaf of a function's result, whether it depends on the arguments, numbers.
 
     Plain: every float is taken to depend on them.
     """
@@ -625,7 +625,7 @@ def _depends(function: Callable, usable: bool, *args: Any) -> tuple[bool, ...]:
 
     def probe(*args):
         for leaf in jax.tree.leaves(function(*args)):
-            # What does not depend on the mapped arguments is computed on the spot.
+            # Under `vmap` what does not depend on the mapped arguments is a concrete number.
             found.append(not is_concrete(leaf) if usable else eqx.is_inexact_array(leaf))
         return 0
 
@@ -635,11 +635,11 @@ def _depends(function: Callable, usable: bool, *args: Any) -> tuple[bool, ...]:
 
 
 def is_affine(function: Callable[..., Sequence[Any]], count: int) -> bool:
-    """Whether all that the function gives of `count` numbers is known to be linear in them, but for
-    constants.
+    """Whether all results of the function, of `count` numbers, are known to be linear in them, but
+    for constants.
 
-    By its program: the numbers are added, scaled and handed on, and nothing else is done with them.
-    Plain: of no function is it known.
+    Its jaxpr shows it: the numbers are added, scaled and handed on, and nothing else is done with
+    them. Plain: no function is known to be.
     """
 
     def trial():
@@ -650,13 +650,13 @@ def is_affine(function: Callable[..., Sequence[Any]], count: int) -> bool:
     return _usable("a look into traced programs", trial) and _is_affine(function, count)
 
 
-#: What keeps numbers linear.
+#: Primitives that are linear in their arguments.
 LINEAR = frozenset(
     """add add_any sub neg copy convert_element_type broadcast_in_dim reshape squeeze
     concatenate slice""".split()
 )
 
-#: What calls another program, and the parameter that holds it.
+#: Primitives that call another jaxpr, and the parameter that holds it.
 CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "custom_jvp_call": "call_jaxpr"}
 
 
@@ -667,8 +667,8 @@ def _is_affine(function: Callable[..., Sequence[Any]], count: int) -> bool:
 
 
 def _degrees(jaxpr: Any, given: Sequence[int]) -> list[int]:
-    """How the results depend on the arguments, and these on numbers: not at all (0), linearly (1),
-    or perhaps in another way (2)."""
+    """How each result depends on some numbers, where the arguments depend on them as `given`: not
+    at all (0), linearly (1), or perhaps in another way (2)."""
     from jax.extend.core import Var
 
     degrees = dict(zip(jaxpr.invars, given, strict=True))
@@ -700,8 +700,8 @@ _computed = False
 
 
 def _is_jax_in_use() -> bool:
-    # Its own list of its backends is empty before. The public function that asks for them starts
-    # them.
+    # JAX's private list of backends is empty before JAX is used. The public function that returns
+    # the list starts them.
     from jax._src import xla_bridge
 
     return len(xla_bridge._backends) > 0

@@ -27,7 +27,7 @@ from ..checks import as_finite, require
 from .compiling import jit
 from .newton import newton
 
-#: Newton's method may take so many steps to correct a point; half of it is quick.
+#: Most Newton steps to correct a point; half as many are quick.
 CORRECTIONS = 8
 #: A correction of this size is rounding, in unknowns of size one and systems that amplify it.
 SMALLEST_CORRECTION = 1e-12
@@ -48,9 +48,9 @@ class Stop(enum.Enum):
 class CurvePoint(NamedTuple):
     """A point of a curve.
 
-    u: the solution, [n + 1]; tangent: of unit length, in the sense of the motion, [n + 1];
+    u: the solution, [n + 1]; tangent: of unit length, in the direction of travel, [n + 1];
     iterations: Newton steps that it took; end: why the curve ends here, None where it goes on;
-    orientation: sign of the determinant.
+    orientation: sign of the determinant of the n + 1 equations.
     """
 
     u: np.ndarray
@@ -75,8 +75,8 @@ def continue_curve(
 
     solve: gives the point of the curve of (u, tangent, length), such as
     `functools.partial(corrected, linearized, args)`. start: a guess of the first point. direction:
-    [n + 1], the direction from there, by its angle with the tangent. span: smallest and
-    largest u, numbers or [n + 1]; the curve ends with a point on the first side that it meets.
+    [n + 1]; of the two tangents there the curve follows the one at an acute angle to it. span:
+    smallest and largest u, numbers or [n + 1]; the curve ends on the first side that it meets.
     step, min_step, max_step: lengths of the first, the shortest and the longest chord.
 
     The last point says why it is the last. Where Newton's method fails at the start there is no
@@ -103,7 +103,7 @@ def continue_curve(
         leaves = np.any(new.u < limits[0]) or np.any(new.u > limits[1])
         if leaves:
             new = _at_limit(solve, point, new, limits)
-        # A point that lies on the side is the last one itself.
+        # A point that lies on the side already is the last one; it is not repeated.
         if not leaves or np.max(np.abs(new.u - point.u)) > SMALLEST_CORRECTION:
             yield point
         point = new
@@ -134,8 +134,8 @@ def _next_point(solve, point: CurvePoint, step: float, steps) -> tuple[CurvePoin
 
 
 def _at_limit(solve, point: CurvePoint, beyond: CurvePoint, limits) -> CurvePoint:
-    """The point where the curve meets the first side of the span, between two others."""
-    # Newton's method in the length of the step, with the plane's normal along the coordinate.
+    """The point where the curve meets the first side of the span, from `point` to `beyond`."""
+    # Newton's method in the plane of that side: its normal is along a coordinate.
     change, short, far = beyond.u - point.u, beyond.u < limits[0], beyond.u > limits[1]
     with np.errstate(divide="ignore", invalid="ignore"):
         parts = (np.where(short, limits[0], limits[1]) - point.u) / change
@@ -150,7 +150,7 @@ def _at_limit(solve, point: CurvePoint, beyond: CurvePoint, limits) -> CurvePoin
 
 
 class Corrected(NamedTuple):
-    """What Newton's method ends with, see `CurvePoint`; found: whether it converged."""
+    """The point that Newton's method ends at, see `CurvePoint`; found: whether it converged."""
 
     u: Any
     tangent: Any

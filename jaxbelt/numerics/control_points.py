@@ -1,10 +1,10 @@
 """Whether a polynomial comes to zero between 0 and 1, by its control points.
 
 In the basis of Bernstein a polynomial lies within its control points, and it has no more roots,
-and no more extrema, than these have changes of sign, or of direction. So control points that are
-positive show that the polynomial is; those that only rise, or rise and then fall to a positive
-value, likewise; and those that are negative at the end and have fallen, or risen once before, or
-after, that it has passed zero once. What else there may be the caller asks of a shorter way.
+and no more extrema, than these have changes of sign, or of direction. So the polynomial is positive
+if its control points are positive, if they only rise, or if they rise and then fall to a positive
+value. It passes zero once if they end below zero and have fallen, or risen once before, or after.
+In all other cases the caller has to ask again on a shorter interval.
 """
 
 import functools
@@ -21,18 +21,18 @@ from jaxtyping import Array
 from .compiling import where_any
 from .polynomials import Jet, jet
 
-#: Part of its range that a polynomial may be wrong by, and still be trusted to rise and fall as it
-#: does.
+#: Largest error of a polynomial, over its range of values, with which its rises and falls are
+#: trusted.
 TRUSTED = 0.25
-#: Newton steps to a root, or an extremum, from that of the control points.
+#: Newton steps to a root, or an extremum, from its estimate by the control points.
 ROOT_STEPS = 3
 
 
 class RootPassage(NamedTuple):
-    """Whether a function that is positive at 0 comes to zero up to 1, arrays of the batch shape.
+    """Whether a function that is positive at 0 comes to zero in (0, 1], arrays of the batch shape.
 
-    once: it passes zero once, and is negative at 1; there: where. cut: it may pass zero and come
-    back, or may not, and is to be asked again up to `there`.
+    once: it passes zero once, at `there`, and is negative at 1. cut: it may pass zero and come
+    back, or may not: the caller has to ask again on the interval up to `there`.
     """
 
     once: Array
@@ -43,8 +43,8 @@ class RootPassage(NamedTuple):
 class Polynomial(NamedTuple):
     """A polynomial on [0, 1].
 
-    points: its control points. coefficients: c0, c1, ... of c0 + c1 theta + ..., where known: they
-    take a third of the operations.
+    points: its control points. coefficients: c0, c1, ... of c0 + c1 theta + ..., where known: its
+    values by them take a third of the operations.
     """
 
     points: list[Array]
@@ -52,7 +52,7 @@ class Polynomial(NamedTuple):
 
     @classmethod
     def of(cls, coefficients: list[Array]) -> "Polynomial":
-        """c0 + c1 theta + c2 theta^2 ..."""
+        """The polynomial c0 + c1 theta + c2 theta^2 ..."""
         n = len(coefficients) - 1
         points = [
             functools.reduce(
@@ -80,7 +80,7 @@ class Polynomial(NamedTuple):
 
 @functools.cache
 def through(nodes: tuple[float, ...]) -> np.ndarray:
-    """The matrix that makes control points of values at as many nodes in [0, 1]."""
+    """The matrix [n, n] that makes control points from values at n nodes in [0, 1]."""
     x, n = np.array(nodes)[:, None], len(nodes) - 1
     k = np.arange(n + 1)
     binomials = np.array([comb(n, i) for i in k], dtype=float)
@@ -97,11 +97,11 @@ def highest_difference(points: Sequence[Array]) -> Array:
 def passage(
     curve: Polynomial, doubt: Array, rounding: Array, trust: Array, keep: Callable[[Array], Array]
 ) -> RootPassage:
-    """Whether a function comes to zero, of which a polynomial is known.
+    """Whether a function comes to zero in [0, 1], by a polynomial `curve` that is close to it.
 
-    doubt: how far the polynomial may be off inside; its ends are exact up to `rounding`. trust:
-    where its shape is trusted whatever the doubt, because the way is as short as can be. keep:
-    has a value computed once for all of its uses.
+    doubt: error of the polynomial inside; its ends are exact up to `rounding`. trust: mask of where
+    its shape is trusted whatever the doubt, because the interval is as short as can be. keep: has a
+    value computed once for all of its uses, see `lanes.materialise`.
     """
     curve, doubt, rounding = lax.stop_gradient((curve, doubt, rounding))
     points = curve.points
@@ -114,7 +114,7 @@ def passage(
 
 
 def _passage(curve: Polynomial, doubt, rounding, trust, keep) -> RootPassage:
-    """`passage`, where the control points alone do not show that there is none."""
+    """`passage`, where the signs of the control points do not show that there is no root."""
     points = curve.points
     steps = [q - p for p, q in pairwise(points)]
     rises, falls = ([way * d > rounding for d in steps] for way in (1.0, -1.0))
@@ -138,17 +138,17 @@ def _passage(curve: Polynomial, doubt, rounding, trust, keep) -> RootPassage:
     inside = jnp.minimum(theta, 1 - theta) > 1e-3
     splits = dips & ~passes & (lowest <= doubt + rounding) & inside & ~trust
     unclear = ~(once | stays | dips)
-    # Newton's method may come to the root at 0 that began the way.
+    # Newton's method may converge to the root at 0, where the interval begins.
     there = jnp.where(dips, theta, jnp.maximum(theta, 0.1 * root))
     there = jnp.where(passes, jnp.minimum(root, theta), there)
-    # What is below zero by rounding, and falls from the beginning, passes it there: of the way to
-    # where it is below by more, less and less would be left.
+    # A function that is below zero by rounding at 0, and falls from there, passes zero at 0: cut to
+    # where it is below by more than rounding, the interval would become shorter and shorter.
     there = jnp.where(once & (points[0] < 0) & ~seen_rise, 0.0, there)
     return RootPassage(once, passes | splits | unclear, jnp.where(unclear, 0.5, there))
 
 
 def _first_passage(points: Sequence[Array], level: Array) -> Array:
-    """Where the line through the control points first goes below zero; 0 where it begins there."""
+    """Where the line through the control points first falls below `level`; 0 if it begins there."""
     n = len(points) - 1
     before, ahead, fall = jnp.zeros_like(points[0]) + n, jnp.zeros_like(points[0]), jnp.ones(())
     for i in reversed(range(n)):
@@ -161,7 +161,7 @@ def _first_passage(points: Sequence[Array], level: Array) -> Array:
 
 
 def _root_step(curve: Polynomial, theta: Array, extreme: Array) -> tuple[Array, Array]:
-    """The root near theta, in [0, 1], or the extremum, and the value there."""
+    """The root near theta, in [0, 1], or the extremum where `extreme`, and the value there."""
     for _ in range(ROOT_STEPS):
         value, slope, bend = curve.at(theta)
         over, under = jnp.where(extreme, slope, value), jnp.where(extreme, bend, slope)

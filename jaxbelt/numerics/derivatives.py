@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 
 def moving_and_fixed(tree: Any, tangents: Any) -> tuple[Any, Any]:
-    """The leaves that have a tangent, and those that have None, each with None elsewhere."""
+    """The leaves that have a tangent, and those that have none, two trees with None elsewhere."""
     has_one = jax.tree.map(lambda t: t is not None, tangents, is_leaf=lambda t: t is None)
     return eqx.partition(tree, has_one)
 
@@ -61,9 +61,9 @@ def in_directions(
 
     args: its arguments, trees; slopes: for each direction the change of each, with None in place of
     what does not change. differentiable(value): the value with None in place of what does not
-    change; so are the derivatives. The value is computed once for all directions. Of `jax.jvp` by
-    itself, in a batch or one after another, XLA computes it again for each: it moves the constants
-    of each copy out of the loop, and no longer sees that two copies are one.
+    change, as in the derivatives. The value is computed once for all directions. By `jax.jvp`, in a
+    batch or one after another, XLA would compute it again for each: it moves the constants of each
+    copy out of the loop, and no longer sees that two copies are the same.
     """
     if not slopes:
         return function(*args), []
@@ -78,13 +78,13 @@ def in_directions(
 
 
 def nan_unless(known: Array, of: Any) -> Array:
-    """0 where `known`, else NaN with the derivative NaN by each number of `of`, a tree.
+    """0 where `known`, else NaN, also in its derivatives by the numbers of the tree `of`.
 
     To be added to results: a NaN that `jnp.where` selects has the derivative 0, which looks like an
     extremum; and what multiplies a NaN, as in padding, has the derivative NaN in reverse mode.
     known: one truth value.
     """
     numbers = [jnp.asarray(leaf) for leaf in jax.tree.leaves(of) if eqx.is_inexact_array(leaf)]
-    # Some that are known are infinite, as edges are.
+    # Some numbers are infinite though the result is known: those of missing edges.
     usable = [jnp.where(known & ~jnp.isfinite(leaf), 0.0, leaf) for leaf in numbers]
     return sum(map(jnp.sum, usable), jnp.zeros(())) * jnp.where(known, 0.0, jnp.nan)

@@ -17,13 +17,13 @@ from jax import lax
 from jaxtyping import Array, ArrayLike
 
 Components = Any
-#: One row for two substeps: the length of one, whether they are the first of their rule, and the
-#: weights of the rule's result in what is wanted, in the last row of the rule.
+#: Columns of a table with a row for two substeps: the length of one, whether they are the first of
+#: their rule, and, in the last row of a rule, the weights of its result in those of the scheme.
 Scheme = tuple[np.ndarray, ...]
 
 
 def scheme(*results: tuple[int, ...]) -> Scheme:
-    """For every result wanted: the numbers of substeps that it is extrapolated from, even ones.
+    """The scheme of some results; each is given by the even numbers of substeps of its rules.
 
     k numbers give order 2k. All have to be among those of the first result.
     """
@@ -49,7 +49,7 @@ def increments(
     Components of the state are kept apart, as scalars: so a batch is an array for each of them.
     """
 
-    # Ways from the start are smaller than states, and so is their rounding.
+    # `way` is the change from the start: it is smaller than the state, and so is its rounding.
     def slopes(way):
         return field(tuple(a + b for a, b in zip(start, way, strict=True)))
 

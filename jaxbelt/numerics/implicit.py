@@ -1,9 +1,8 @@
-"""Derivatives of what is found by iteration, by the implicit function theorem.
+"""Derivatives of solutions found by iteration, by the implicit function theorem.
 
-What an iteration has found is known as a number. Its derivatives follow from the equations that it
-solves: `solution` gives those of many unknowns, of every order; `step_to_root` and `delay_of_root`
-those of the root of one equation, to first order, inside of kernels, where a step is all that there
-is room for.
+An iteration gives a solution as a number. Its derivatives follow from the equations that it solves:
+`solution` gives those of many unknowns, of every order; `step_to_root` and `delay_of_root` those of
+the root of one equation, to first order, inside of kernels, where there is room for one step only.
 """
 
 import abc
@@ -21,7 +20,7 @@ from .derivatives import moving_and_fixed
 
 
 class Equations(eqx.Module):
-    """As many equations as unknowns, for `newton.solve`; what it is made of has no derivatives."""
+    """As many equations as unknowns, for `newton.solve`; its own fields have no derivatives."""
 
     @abc.abstractmethod
     def residual(self, given: Any, z: Any) -> Array:
@@ -37,7 +36,7 @@ class Equations(eqx.Module):
         return of_flat(flat), jax.jacfwd(of_flat)(flat)
 
     def moved(self, given: Any, z: Any, tangents: Any) -> tuple[Array, Array]:
-        """How fast the equations change as `given` moves by the tangents, None where it does not,
+        """The derivative of the equations along the tangents of `given`, None where it is fixed,
         [n]; and their derivatives with respect to the unknowns, [n, n]."""
         moving, fixed = moving_and_fixed(given, tangents)
 
@@ -66,9 +65,9 @@ def _(primals, tangents):
 
 
 def step_to_root(value: Array, slope: Array, where: Any = True) -> Array:
-    """The Newton step to the root of an equation; 0 where the slope is, and elsewhere than `where`.
+    """The Newton step to the root of an equation; 0 where the slope is 0 or `where` is false.
 
-    At a root that is known and has no derivatives the step is rounding, and has the derivatives of
+    At a root that was found without derivatives the step is rounding, and has the derivatives of
     the root.
     """
     where = where & (slope != 0)
@@ -76,9 +75,9 @@ def step_to_root(value: Array, slope: Array, where: Any = True) -> Array:
 
 
 def delay_of_root(function: Callable[..., Array], y: Any, rates: Any) -> Array:
-    """By how much later than at y a function of y vanishes, near a root: 0, with its derivatives.
+    """The time from y, at a root of a function, to the root: 0, with the derivatives of that time.
 
-    y: its arguments, which change at these rates.
+    y: the arguments of the function, which change at the `rates`.
     """
     value, slope = jax.jvp(function, y, rates)
     return step_to_root(value - lax.stop_gradient(value), slope)

@@ -22,19 +22,19 @@ from jaxtyping import Array
 
 from .implicit import Equations, solution
 
-#: Newton steps: five or six do from a guess that is good to the longest one, none from farther off.
+#: Most steps: five or six do from a guess good to LONGEST_NEWTON_STEP, from farther off none do.
 NEWTON_STEPS = 12
 #: Longer Newton steps are cut to this length: guesses are good to that.
 LONGEST_NEWTON_STEP = 0.5
-#: Equations with smaller errors hold. Of 337 cycles of oscillators at random Newton's method left
-#: 3e-13 at most; from guesses that are none it left rounding, too, or 7e-4 and more.
+#: Equations with smaller residuals hold. For 337 cycles of oscillators at random Newton's method
+#: left 3e-13 at most; from bad guesses it converged, too, or left 7e-4 and more.
 HOLDS = 1e-9
 #: Steps of this length are rounding: unknowns are of size one.
 STEP_ROUNDING = 1e-13
-#: Number of last steps that measure how far unknowns still move that do not converge.
+#: Number of last steps by which `Newton.unsettled` measures how far the unknowns still move.
 LAST = 4
-#: Larger unknowns are of another size, such as the time stuck to a belt that hardly moves: steps
-#: are measured in parts of them.
+#: Steps of larger unknowns, such as the time stuck to a belt that hardly moves, are measured
+#: relative to them.
 LARGE = 100.0
 
 
@@ -42,9 +42,9 @@ class Newton(eqx.Module):
     """What Newton's method ends with.
 
     z: the unknowns; residual: the largest one before the last step; iterations: steps made;
-    lengths: how long each was, [NEWTON_STEPS], NaN where there was none, of unknowns beyond LARGE
-    in units of |z| / LARGE; matrix: of the last one; rounding: how far errors of rounding in the
-    equations move each unknown, [n].
+    lengths: of all steps, [steps], NaN where none was made, for unknowns beyond LARGE in units of
+    |z| / LARGE; matrix: of the last step; rounding: how far errors of rounding in the equations
+    move each unknown, [n].
     """
 
     z: Any
@@ -56,7 +56,7 @@ class Newton(eqx.Module):
 
     @property
     def last_two(self) -> tuple[Array, Array]:
-        """The length of the last step and that of the one before; of the only one twice."""
+        """The lengths of the last step and of the one before; after one step the same twice."""
         before = jnp.maximum(self.iterations - 2, 0)
         return self.lengths[self.iterations - 1], self.lengths[before]
 
@@ -73,7 +73,7 @@ class Newton(eqx.Module):
 def is_settled(last: Array, before: Array, bound: float = STEP_ROUNDING) -> Array:
     """Whether the next Newton step would be rounding, by the lengths of the last two.
 
-    It is shorter by the same factor at least. bound: of steps that count as rounding.
+    The next step is shorter by the same factor at least. bound: shorter steps are rounding.
     """
     return last * jnp.minimum(last / before, 1.0) < bound
 

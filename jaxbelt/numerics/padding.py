@@ -1,5 +1,5 @@
-"""Rows of trees of arrays: taken apart, and made more of, so that few shapes are compiled or groups
-have one size."""
+"""Rows of trees of arrays: taken apart, and padded, so that few shapes are compiled or groups have
+one size."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -13,12 +13,12 @@ from ..checks import pick
 
 
 def filled_up(tree: Any, rows: Any, size: int) -> Any:
-    """Some rows of a tree of known arrays, filled up to `size` with the last of them."""
+    """The given rows of a tree of concrete arrays, filled up to `size` with the last of them."""
     return pick(tree, np.asarray(rows)[np.minimum(np.arange(size), len(rows) - 1)])
 
 
 def in_batches(tree: Any, rows: np.ndarray, size: int) -> Iterator[tuple[np.ndarray, Any]]:
-    """Some rows of a tree of known arrays in batches, `filled_up`, each with its rows' numbers."""
+    """Batches of the given rows of a tree of concrete arrays: (row numbers, `filled_up` tree)."""
     for first in range(0, len(rows), size):
         batch = rows[first : first + size]
         yield batch, filled_up(tree, batch, size)
@@ -31,9 +31,9 @@ def each_row(tree: Any) -> Iterator[Any]:
 
 
 def longer(tree: Any, size: int, *, axis: int = 0, fill: int | float | None = None) -> Any:
-    """The arrays of a tree made longer along an axis, up to `size`, with a number.
+    """The arrays of a tree padded along an axis, up to `size`.
 
-    fill: that number; None: the last row of each array.
+    fill: the number to pad with; None: the last row of each array.
     """
 
     def one(leaf: Array) -> Array:

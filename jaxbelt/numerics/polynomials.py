@@ -1,4 +1,4 @@
-"""Polynomials by their coefficients, that of the power 0 first."""
+"""Polynomials given by their coefficients, the lowest order first."""
 
 from collections.abc import Sequence
 
@@ -34,7 +34,7 @@ def derivative(coefficients: Sequence[Array]) -> list[Array]:
 
 
 def quintic(start: Jet, end: Jet) -> tuple[Array, ...]:
-    """The coefficients of the quintic that has these values and derivatives at 0 and at 1."""
+    """The coefficients of the quintic with the given values and derivatives at 0 and at 1."""
     (p0, v0, a0), (p1, v1, a1) = start, end
     d, e, f = p1 - p0 - v0 - 0.5 * a0, v1 - v0 - a0, a1 - a0
     last = 10 * d - 4 * e + 0.5 * f, -15 * d + 7 * e - f, 6 * d - 3 * e + 0.5 * f

@@ -41,15 +41,15 @@ _log = logging.getLogger("jaxbelt")
 #: Whether programs are kept at all.
 ON = os.environ.get("JAXBELT_CACHE", "1") not in ("", "0")
 
-#: First line of every file, before its checksum; grows with the format.
+#: First line of every file, before its checksum; the number grows when the format changes.
 MAGIC = b"jaxbelt program 1 "
 SUFFIX = ".program"
-#: Bytes that the folder may have before the least recently used programs go, and how much is left.
+#: Bytes that the folder may have before the least recently used programs go; the part that stays.
 BOUND = 2**30
 LEFT = 0.9
 #: Seconds after which a file that was not renamed is known to be left behind.
 ABANDONED = 3600.0
-#: Packages whose code programs are made of.
+#: Packages on whose versions programs depend.
 PACKAGES = "jax jaxlib equinox diffrax optimistix lineax numpy".split()
 
 
@@ -200,7 +200,7 @@ def _write(path: Path, key: str, contents: bytes) -> None:
 
 @functools.cache
 def surroundings() -> str:
-    """What all programs of this process are made of: sources, versions, processor, settings."""
+    """Checksum of what all programs depend on: sources, versions, processor, settings."""
     versions = [f"{name} {importlib.metadata.version(name)}" for name in PACKAGES]
     flags = [os.environ.get(name, "") for name in ("XLA_FLAGS", "LIBTPU_INIT_ARGS")]
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
@@ -217,12 +217,12 @@ def _sources() -> str:
     return digest.hexdigest()
 
 
-#: Folders of jaxbelt whose modules programs are made of. All of them are imported at once.
+#: Folders of jaxbelt on whose modules programs depend. All of them are imported at once.
 FOLDERS = "numerics model kernel motion cycles sweeps bifurcations inverse".split()
 
 
 def _constants() -> list[str]:
-    """Numbers and words by a name in capitals in the modules of jaxbelt, as they are now: a session
+    """Constants, with names in capitals, of jaxbelt's modules, with their present values: a session
     that changes one has programs of its own, and leaves none to others."""
     found = []
     for name, module in sorted(sys.modules.items()):
@@ -261,8 +261,8 @@ HOLE = Hole()
 class KeptProgram(NamedTuple):
     """A compiled program of arrays, and how its results are put together.
 
-    call: of a list of arrays; gives a list of them. structure, rest: of the results; rest has
-    `HOLE` in place of every array.
+    call: makes a list of arrays from a list of arrays. structure: of the tree of results; rest:
+    its leaves, with `HOLE` in place of every array.
     """
 
     call: Callable[[list[Any]], list[Any]]
@@ -276,7 +276,7 @@ class KeptProgram(NamedTuple):
 
 
 def type_of_leaf(leaf: Any) -> Any:
-    """What a program is compiled for: shape, type, and whether this is a weak one."""
+    """The type of an argument: shape, dtype, and whether the dtype is weak."""
     if isinstance(leaf, jax.Array):
         return leaf.shape, leaf.dtype, leaf.weak_type
     if isinstance(leaf, np.ndarray | np.generic):
@@ -302,13 +302,13 @@ def are_kept() -> bool:
 
 
 def jax_settings() -> tuple[Any, ...]:
-    """Those of JAX that programs depend on, hashable."""
+    """The settings of JAX that programs depend on, hashable."""
     return _config().trace_context(), _config().debug_nans.value, _config().debug_infs.value
 
 
 def can_be_kept(arrays: list[Any]) -> bool:
-    """Whether programs of these arrays, with the settings of today, can be kept: those for one
-    processor, in which nothing is looked at underway."""
+    """Whether programs can be kept with the present settings: those for the CPU as the only device,
+    without checks of values underway."""
     watched = (
         _config().debug_nans.value or _config().debug_infs.value or _config().disable_jit.value
     )
@@ -316,10 +316,10 @@ def can_be_kept(arrays: list[Any]) -> bool:
 
 
 def key_of(function: Callable, template: Any, signatures: Sequence[Any], options: Any) -> str:
-    """Identity of a program; raises where this cannot be known."""
+    """Key of a program, by all that it depends on; raises where this cannot be known."""
     name = getattr(function, "__module__", ""), getattr(function, "__qualname__", "")
     mark = fingerprint((name, function, template, options))
-    # Without what has no name but its address: an object of JAX, empty outside of traces.
+    # Words with an address are left out: they are of an object of JAX, empty outside of traces.
     context = [word for word in map(repr, jax_settings()[0]) if " at 0x" not in word]
     parts = surroundings(), _constants(), mark, [str(one) for one in signatures], context
     return hashlib.sha256(repr(parts).encode()).hexdigest()
@@ -350,8 +350,8 @@ def compile_and_keep(
 
 
 def _compile(function: Callable, arrays: list[Any], options: Any) -> Any:
-    """Under a name of its own, and never written there, JAX's own cache does not have it: what
-    comes out of that cannot be loaded again."""
+    """The function, compiled for the arrays. It must not come out of JAX's own cache, for then it
+    could not be loaded again: its name is its own, and it is never written to that cache."""
     with _config().persistent_cache_min_compile_time_secs(1e9):
         return jax.jit(function).lower(arrays).compile(compiler_options=options)
 
@@ -430,7 +430,7 @@ def _start_lapack() -> None:
 
 
 def _results_in(pickled: bytes, known: list[Any]) -> tuple[Any, list[Any]]:
-    """Structure of the results and the rest, see `KeptProgram`."""
+    """`structure` and `rest` of the results, see `KeptProgram`."""
 
     class Unpickler(pickle.Unpickler):
         def persistent_load(self, pid):
@@ -441,7 +441,7 @@ def _results_in(pickled: bytes, known: list[Any]) -> tuple[Any, list[Any]]:
 
 
 # A user's classes and functions are in arguments and come back in results. They cannot be found by
-# name, so a file contains their places among those of the arguments.
+# name, so a file contains their numbers among those of the arguments.
 
 
 def _own_objects(template: Any) -> list[Any]:

@@ -1,10 +1,10 @@
 """Where a step of an orbit first meets one of several guards.
 
-Guards are positive at the start of the step and negative beyond their root. The smallest of them
-has kinks, on which a search for its root may end, and near a tangency one guard is small where
-another has its root. So each is searched for by itself. The extrema come first, the zeros of x2'
-and of x2: up to an extremum the other guards are monotone, and the sign of one at the extremum, as
-accurate as the integration, shows whether it has a root before.
+Guards are positive at the start of the step and negative beyond their root. Their minimum has
+kinks, on which a search for its root may end, and near a tangency one guard is small where another
+has its root. So the root of each guard is searched for by itself. The extrema come first, the zeros
+of x2' and of x2: up to an extremum the other guards are monotone, and the sign of a guard at the
+extremum, as accurate as the integration, shows whether it has a root before.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ Guards = tuple[Array, Array]
 NEAREST = 5e-13
 #: A guard this small at the start is rounding of numbers of size one: the orbit has just left it.
 JUST_LEFT = 5e-16
-#: A bracket that interpolation does not narrow in so many steps is halved in every other.
+#: Steps after which a bracket is halved in every other step, and most steps of a search.
 TRIALS, MOST = 8, 100
 
 
@@ -30,16 +30,16 @@ def first_root(
 ) -> tuple[Array, Array]:
     """The time in (0, end] at which a guard first vanishes, and the number of that guard.
 
-    guards: all of them at a time; the last `extrema` of them are extrema. Where none is negative at
-    the end the number is -1, and the time the end.
+    guards: gives all of them at a time; the last `extrema` of them are extrema. Where none is
+    negative at the end the number is -1, and the time is the end.
     """
     numbers = jnp.arange(at_end[0].size)
     is_extremum = numbers >= numbers.size - extrema
 
     def passed(state):
         _, (values, slopes), _, known = state
-        # Negative by rounding and rising: the orbit is about to leave it, as where a boundary lies
-        # so near to an extremum that the one was found before the other by rounding.
+        # Negative by rounding and rising: the orbit is about to become positive in this guard, as
+        # where a boundary lies so near to an extremum that rounding exchanged their order.
         leaves = (values > -JUST_LEFT) & (slopes > 0)
         return (values < 0) & ~leaves & ~known
 
@@ -60,8 +60,9 @@ def first_root(
 def _root(guards, which: Array, at_start: Guards, end: Array, at_end: Guards):
     """The root of one guard in (0, end], and all guards there, by the Illinois method.
 
-    At 0 it may vanish, or be negative by rounding, where the orbit has just left it. Only values
-    make trial points: rates of change round differently in a batch, and its runs would differ.
+    At 0 the guard may vanish, or be negative by rounding, where the orbit has just left it. Trial
+    points come from values only: rates of change round differently in a batch than alone, and so
+    would the runs.
     """
 
     def pick(both):
@@ -83,12 +84,12 @@ def _root(guards, which: Array, at_start: Guards, end: Array, at_end: Guards):
         a, fa, b, fb, left, _, _, count = state
         halved = (count > TRIALS) & (count % 2 == 0)
         c = jnp.where(halved, 0.5 * (a + b), (a * fb - b * fa) / (fb - fa))
-        # Not nearer to an end: once that is the root, up to rounding, the other follows at once.
+        # Not nearer to an end than this: if that end is the root, the other then closes in at once.
         c = jnp.clip(c, a + shortest, b - shortest)
         at_c = guards(c)
         value, _ = pick(at_c)
         inside = value > 0
-        # An end that stays for the second time counts half.
+        # The value at an end that stays for the second time is halved.
         fa, fb = jnp.where(left < 0, 0.5, 1.0) * fa, jnp.where(left > 0, 0.5, 1.0) * fb
         return (
             jnp.where(inside, c, a),

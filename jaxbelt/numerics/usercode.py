@@ -1,4 +1,4 @@
-"""Code of a user's own in compiled programs: whether it still is what it was.
+"""User-defined code in compiled programs: whether it still is what it was.
 
 JAX finds a compiled program in memory by the classes and objects that it is called with: laws,
 forces, conditions, functionals. What these read may have changed since: globals, attributes of
@@ -17,12 +17,11 @@ import jax
 
 from ..identity import REPR_TYPES, fingerprint_of_known, is_installed, own_parts
 
-#: By the address of a part: a reference that ends with it, or the part itself, and its
-#: fingerprint.
+#: By the `id` of a part: a weak reference to the part, or the part itself, and its fingerprint.
 _remembered: dict[int, tuple[Any, str]] = {}
 #: Whether a call whose arguments are watched is under way: the calls in its trace are part of it.
 _in_call = contextvars.ContextVar("in_call", default=False)
-#: What else is to be forgotten with JAX's programs.
+#: Functions to call whenever JAX's programs are forgotten.
 _also_forgotten: list[Callable[[], None]] = []
 
 
@@ -33,7 +32,7 @@ def forgotten_with_programs(forget: Callable[[], None]) -> None:
 
 @contextlib.contextmanager
 def watched(leaves: list[Any], structure: Any) -> Iterator[None]:
-    """Around the call of a program with these arguments: where code of a user's own among them has
+    """Around the call of a program with these arguments: where user-defined code among them has
     changed since the last call, programs are forgotten first."""
     parts = [] if _in_call.get() else [*_parts_of_structure(structure), *_parts_of_leaves(leaves)]
     if not parts:
@@ -68,7 +67,7 @@ def _known_parts(structure: Any) -> list[Any]:
 
 
 def _parts_of_leaves(leaves: list[Any]) -> list[Any]:
-    """Of the leaves that are no numbers."""
+    """The `own_parts` of the leaves that are no numbers."""
     found = []
     for leaf in leaves:
         if not (hasattr(leaf, "dtype") or isinstance(leaf, REPR_TYPES) or is_installed(leaf)):

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import jax
 
-#: Whether programs have the form for accelerators on any device. JAX has programs of their own, and
-#: so has the store of programs, for each value of such a context.
+#: Whether programs have the form for accelerators on any device. JAX, and the store of programs,
+#: keep separate programs for each value of such a context.
 _as_accelerator = jax.make_user_context(default_value=False)
 
 
@@ -33,8 +33,8 @@ class SideBySide(NamedTuple):
 
 
 def is_cpu() -> bool:
-    """Whether programs are those for the CPU: JAX's default backend is, and nothing says
-    otherwise."""
+    """Whether programs have the form for the CPU: JAX's default backend is one, and
+    `as_on_accelerator` is not in force."""
     return jax.default_backend() == "cpu" and not _as_accelerator.value
 
 

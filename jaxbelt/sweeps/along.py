@@ -1,12 +1,12 @@
-"""Reducers that are asked between events, too: at moments of the motion, with integrals over it.
+"""The observer of reducers that are also updated between events, and integrals along the motion.
 
 Steps are those of `step.take_step`. A step that passes a section is repeated with a shorter length
 until one of its ends is so near to the crossing that a Taylor step leads there; the run itself goes
-on from the end of the step. Stick phases are known in closed form. Integrals are summed by the
-stages of the steps, as the motion is, and over stick phases by Gauss's rule.
+on from the end of the step. Stick phases are known in closed form. Integrals are advanced by
+the Runge-Kutta stages, like the state, and over stick phases by Gauss's rule.
 
-The time of a moment carries no derivative as it is found. A Newton step from there, of size 0 but
-for rounding, gives it the derivative of the implicit function, so results have the right
+The search for the time of a moment carries no derivatives. One more Newton step, of size 0 but for
+rounding, gives that time the derivative of the implicit function, so results have the right
 derivatives.
 """
 
@@ -69,7 +69,7 @@ class Motion(eqx.Module):
 
 
 def rates_of(reducer: Any, osc: Oscillator, motion: Motion) -> Any:
-    """The rates of a reducer; integers and truth values become floats, as their integrals are."""
+    """The rates of a reducer; integers and booleans become floats, because their integrals are."""
 
     def integrand(rate):
         rate = jnp.asarray(rate)
@@ -79,10 +79,10 @@ def rates_of(reducer: Any, osc: Oscillator, motion: Motion) -> Any:
 
 
 class _Watched(eqx.Module):
-    """Memory of the runs, arrays [lanes].
+    """Memory of the observer, arrays [lanes].
 
-    state: of the reducer; sides: the side of each section; passed: number of fixed times that are
-    past.
+    state: the reducer's state; sides: the side of each section, 1 or -1; passed: for each `AtTimes`
+    or `AtPhase` the number of its next time.
     """
 
     state: Any
@@ -101,7 +101,7 @@ class Along(Observer):
         return checked(getattr(self.reducer, "at", (AtEvents(),)))
 
     def _sections(self) -> list[tuple[int, int, Callable]]:
-        """Number, direction and function of the moments that are sections."""
+        """(number in `at`, direction, function) of each moment that is a section."""
         return [
             (i, getattr(moment, "direction", 0), section_of(moment))
             for i, moment in enumerate(self.at)
@@ -116,7 +116,7 @@ class Along(Observer):
     # --- integrals
 
     def rates(self, osc: OwnOscillator, mode: Mode, t, x1, x2) -> Any:
-        """The reducer's rates, a tree of arrays [lanes], or None if it has none."""
+        """The reducer's rates, a tree of arrays [lanes], or None without a method `rates`."""
         if not hasattr(self.reducer, "rates"):
             return None
         now = at_time(osc, t)
@@ -140,7 +140,7 @@ class Along(Observer):
         return _Watched(state, tuple(sides), passed)
 
     def integrals(self, osc, lanes):
-        """Zeros: the integrals of runs that begin."""
+        """Zeros in the structure of the rates: the integrals of runs that begin."""
         return jax.tree.map(
             jnp.zeros_like, self.rates(osc, lanes.mode, lanes.t, lanes.x1, lanes.x2)
         )
@@ -179,7 +179,7 @@ class Along(Observer):
         for (number, direction, function), side, cut in parts:
             now = _seen(function, osc, new, new.x1, new.x2)
             now = jnp.where(kept, side_of(*now, side), side)
-            # The nearer end; from there a Taylor step leads to the crossing.
+            # A Taylor step leads to the crossing from the end of the step that is nearer to it.
             near = choose(cut.at_start, lanes, new)
             delta = jnp.zeros_like(near.t)
             for _ in range(2):
@@ -190,7 +190,7 @@ class Along(Observer):
             found.append((time, jnp.full_like(lanes.events, number), cut.at_start, delta))
             sides.append(now)
         for _ in found:
-            # One section may be crossed near the start, and another one near the end.
+            # In order of time: one section may be crossed near the start, another near the end.
             time, number, at_start, delta = functools.reduce(_sooner, found)
             wanted = jnp.isfinite(time)
             seen = self._ask(seen, osc, choose(at_start, lanes, new), delta, wanted, number)
@@ -204,7 +204,7 @@ class Along(Observer):
         return replace(new, memory=memory)
 
     def _ask(self, seen: _Watched, osc, lanes: Lanes, delta, wanted, number) -> _Watched:
-        """The state after an update at a moment that is `delta` away from the lanes."""
+        """The memory after `update` a time `delta` after the lanes, where `wanted` holds."""
         t, (x1, x2) = lanes.t + delta, _moved(osc, lanes, delta)
         ends = [
             self.rates(osc, lanes.mode, *state)
@@ -216,8 +216,7 @@ class Along(Observer):
         return self._update(seen, osc, place, number, totals, wanted)
 
     def _update(self, seen: _Watched, osc, place: Any, number, totals, wanted) -> _Watched:
-        """The state after an update in lanes where `wanted` holds; place: t, x1, x2, kind and
-        belt."""
+        """The memory after `update` where `wanted` holds; place: (t, x1, x2, kind, belt)."""
         t, x1, x2, kind, belt = place
         number = jnp.broadcast_to(jnp.asarray(number, int), t.shape)
         length = osc.units.length
@@ -245,7 +244,7 @@ class Along(Observer):
         lanes = replace(lanes, integrals=totals)
         sides = []
         for (number, direction, function), side in zip(self._sections(), seen.sides, strict=True):
-            # Where the field jumps, its extrema jump, too.
+            # Where the field jumps at an event, a section such as x2' = 0 may be passed by a jump.
             value = _seen(function, osc, lanes, lanes.x1, lanes.x2)
             now = jnp.where(busy & ~lanes.done, side_of(*value, side), side)
             wanted = (now != side) & (now * direction >= 0)
@@ -254,7 +253,7 @@ class Along(Observer):
         return replace(lanes, memory=replace(seen, sides=tuple(sides)))
 
     def _over_hold(self, osc, before: Lanes, after: Lanes, holds) -> Any:
-        """Integrals after a stick phase, or rest."""
+        """The integrals after a stick phase, or rest, in lanes where `holds`."""
         duration = jnp.where(holds, after.t - before.t, 0.0)
         totals = after.integrals
         for node, weight in NODES if totals is not None else ():
@@ -266,7 +265,7 @@ class Along(Observer):
         return totals
 
     def _held(self, seen: _Watched, osc, ones, before: Lanes, after: Lanes, holds) -> _Watched:
-        """Takes the moments within a stick phase, or rest, in their order: x1 moves evenly."""
+        """The memory after the moments within a stick phase, or rest; x1 is linear in time."""
         frozen, start, end = lax.stop_gradient((osc, before, after))
         course = Course((start.x1, end.x1 - start.x1), start.x2, end.t - start.t)
         tables, sides = [], []
@@ -286,7 +285,7 @@ class Along(Observer):
             flags = [*due, *(jnp.isfinite(_first(table)) for table in tables)]
             return jnp.any(functools.reduce(jnp.logical_or, flags, jnp.zeros_like(after.done)))
 
-        # What is due is computed once: where it was again, rounded otherwise, the loop did not end.
+        # `_due` once per pass: a second computation rounded differently, and the loop never ended.
         def ask(state):
             seen, tables, due = state
             seen, tables = self._ask_next_held(seen, tables, due, osc, before, after, holds)
@@ -295,14 +294,17 @@ class Along(Observer):
         return lax.while_loop(pending, ask, (seen, tables, self._due(seen, osc, after)))[0]
 
     def _due(self, seen: _Watched, osc: OwnOscillator, after: Lanes) -> list[Array]:
-        """For each of the fixed times the lanes that have passed it, also at the start of a run."""
+        """For each `AtTimes` or `AtPhase` the mask of runs at or past its next time."""
         return [
             (after.run >= 0) & (times.next_time(osc, passed) <= after.t)
             for (_, times), passed in zip(self._times(), seen.passed, strict=True)
         ]
 
     def _ask_next_held(self, seen: _Watched, tables, dues, osc, before, after, holds):
-        """The state after the next moment of each lane, and the tables without that moment."""
+        """The memory after the next moment of each lane, and the tables without that moment.
+
+        tables: crossings of each section, from `crossings_held`; dues: from `_due`.
+        """
         duration = after.t - before.t
         safe = jnp.where(duration > 0, duration, 1.0)
         theta, number = jnp.full_like(duration, jnp.inf), jnp.zeros(duration.shape, int)
@@ -347,18 +349,18 @@ class Along(Observer):
 
 
 def _sooner(one: tuple[Array, ...], other: tuple[Array, ...]) -> tuple[Array, ...]:
-    """Of two moments, the times first, the one that is sooner in each lane."""
+    """Lane by lane the earlier of two moments, tuples of arrays [lanes] with the time first."""
     later = other[0] < one[0]
     return tuple(jnp.where(later, b, a) for a, b in zip(one, other, strict=True))
 
 
 def _first(table: tuple[Array, ...]) -> Array:
-    """The earliest crossing in each lane."""
+    """Theta of the earliest crossing in each lane, [lanes]; inf where there is none."""
     return functools.reduce(jnp.minimum, [jnp.min(part, axis=0) for part in table])
 
 
 def _state_and_rate(osc: OwnOscillator, lanes: Lanes) -> tuple[Array, Array, Array]:
-    """x1, x2 and x2' in the mode of the lanes, which slip; without derivatives."""
+    """x1, x2 and x2' of slipping lanes in their mode, without derivatives."""
     osc, lanes = lax.stop_gradient((osc, lanes))
     if has_clock(osc):
         return lanes.x1, lanes.x2, _field(osc, lanes.mode, lanes.x1, lanes.x2, lanes.t)
@@ -366,7 +368,7 @@ def _state_and_rate(osc: OwnOscillator, lanes: Lanes) -> tuple[Array, Array, Arr
 
 
 def _field(osc: OwnOscillator, mode: Mode, x1: Array, x2: Array, t: Array | None = None) -> Array:
-    """x2' of a mode; a mass that sticks goes with its belt. t: the time, where it is known."""
+    """x2' in a mode; x2' of the belt where the mass sticks. t: the time; None without a clock."""
     if t is not None:
         return field_at(osc, mode, (x1, x2, t))[1]
     return jnp.where(mode.any_stuck, 0.0, mode_acceleration(osc, mode, x1, x2))
@@ -377,13 +379,13 @@ def _clock(osc: OwnOscillator, t: Array) -> tuple[Array, ...]:
 
 
 def _seen(function, osc: OwnOscillator, lanes: Lanes, x1: Array, x2: Array):
-    """A section's value and rate at a state of lanes."""
+    """A section's value and its rate in time at the state (x1, x2), in the lanes' mode."""
     a = _field(osc, lanes.mode, x1, x2, *_clock(osc, lanes.t))
     return value_and_rate(function, osc, lanes.mode, x1, x2, a)
 
 
 def _moved(osc: OwnOscillator, lanes: Lanes, delta: Array) -> tuple[Array, Array]:
-    """The state that is `delta` away, by Taylor's formula of order 3 in x1 and 2 in x2."""
+    """The state a time `delta` later, by Taylor's formula of order 3 in x1 and 2 in x2."""
     field = functools.partial(_field, osc, lanes.mode)
     x1, x2 = lanes.x1, lanes.x2
     clock = _clock(osc, lanes.t)
@@ -395,9 +397,9 @@ def _moved(osc: OwnOscillator, lanes: Lanes, delta: Array) -> tuple[Array, Array
 
 
 def _to_section(function, osc, lanes: Lanes, delta, low, high) -> Array:
-    """Time to a section, by a Newton step from `delta`, between two bounds.
+    """Time to a section: one Newton step from `delta`, clipped to [low, high].
 
-    Its derivatives are those of the implicit function, whatever the bounds.
+    Its derivatives are those of the implicit function, even where it is clipped.
     """
     delta = lax.stop_gradient(delta)
     later = replace(lanes, t=lanes.t + delta) if has_clock(osc) else lanes

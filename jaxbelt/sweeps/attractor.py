@@ -1,4 +1,4 @@
-"""The observer of attractors: what each run leads to, found as early as it is certain."""
+"""The observer of attractors: what each run leads to, reported as soon as it is certain."""
 
 import functools
 from collections.abc import Mapping
@@ -23,26 +23,26 @@ from ..results import Status
 #: Kinds of attractors, in the order of their codes.
 KINDS = ("undecided", "equilibrium", "cycle", "stuck")
 UNDECIDED, EQUILIBRIUM, CYCLE, STUCK_FOR_EVER = range(4)
-#: Code of a closed orbit that is one of a continuum; it becomes undecided at the end.
+#: Internal code of a closed orbit in a continuum of such; `finish` reports it as undecided.
 IN_CONTINUUM = len(KINDS)
 
 
 def signature(word: int, belts: int) -> str:
-    """Name of a cycle's signature; "none" at rest, "long" if no word holds it."""
+    """Name of a cycle's signature; "none" at rest, "long" if it has too many events for a word."""
     if word < 1:
         return "none" if word == 0 else "long"
     return signature_name(word_events(word, belts))
 
 
 class _LoopSoFar(eqx.Module):
-    """The present loop, since the mark: arrays [lanes].
+    """The loop since the mark, and the attractor once found, arrays [lanes].
 
     Attributes:
         mark: State that later ones are compared with.
         x1_min: Smallest x1.
         x1_max: Largest x1.
         sticks: Time stuck to each belt.
-        word: The events, see `events.word_events`.
+        word: The events of the loop as a number, see `events.word_events`.
         tops: Number of maxima of x1 since the last stick phase.
         previous: x1 at the last maximum.
         previous_t: Time of the last maximum.
@@ -50,7 +50,7 @@ class _LoopSoFar(eqx.Module):
         wake: Time before which steps do not end at maxima.
         kind: Kind of the attractor, once found.
         period: Its period, once found.
-        transient: Time at which it was found.
+        transient: Time at which it was reached; of a cycle, the beginning of the repeated loop.
         loop_events: Number of events in one loop.
     """
 
@@ -71,7 +71,7 @@ class _LoopSoFar(eqx.Module):
 
 
 def _extended(osc: OwnOscillator, loop: _LoopSoFar, lanes: Lanes, passage: Passage) -> _LoopSoFar:
-    """The loop with what has just happened: extrema of x1, time stuck, events."""
+    """The loop with the passage added: extrema of x1, time stuck, events."""
     sticks = tuple(
         total + jnp.where(stuck, passage.duration, 0.0)
         for total, stuck in zip(loop.sticks, passage.mode.stuck, strict=True)
@@ -85,15 +85,15 @@ def _extended(osc: OwnOscillator, loop: _LoopSoFar, lanes: Lanes, passage: Passa
 
 
 class Attractor(Observer):
-    """What the run leads to; the run ends as soon as that is known.
+    """Observer of the attractor that a run leads to; the run ends as soon as it is known.
 
     - A cycle that sticks repeats the state at the end of a stick phase; from there the orbit is a
       function of the parameters alone, so it repeats to the last bits. A cycle that does not stick
-      is approached: its top (a maximum of x1, where x2 = 0) repeats, see `settling`.
+      is approached; it is found when a top (a maximum of x1, where x2 = 0) repeats, see `settling`.
     - An equilibrium: the run begins on one, or the orbit has entered a disc that a fixed point
       attracts, see `rest.settling_margin`. A pseudo-focus is recognised by `is_captured`.
     - Stuck for ever: on a belt at rest.
-    - None of these: a closed orbit beside others, as around a centre, see `rest.is_neutral`. It
+    - None of these: a closed orbit in a continuum, as around a centre, see `rest.is_neutral`. It
       attracts nothing, and the run ends undecided with the status NEUTRAL.
 
     The signature of a cycle, (kind, belt) event by event, is a number, see `word_events`. The
@@ -115,22 +115,22 @@ class Attractor(Observer):
         "transient": Variable("time at which the attractor was reached", dimension="time"),
         "n_events": Variable("number of events (of a cycle: in one loop)", "int32"),
     }
-    #: Distance to the last state at the end of a stick phase, over the amplitude, up to which both
-    #: count as equal; only rounding separates them.
+    #: States at the ends of two stick phases count as equal if x1 differs by no more than this
+    #: times the amplitude; only rounding separates them.
     EXACT: ClassVar[float] = 1e-9
-    #: A top that moves by less than so many tolerances, over the amplitude, moves by rounding
-    #: alone.
+    #: A top that moves by less than this many tolerances, relative to the amplitude, moves by
+    #: rounding alone.
     STANDS: ClassVar[float] = 30.0
-    #: Motion that is smaller than so many tolerances comes from the integrator.
+    #: Motion smaller than this many tolerances, in own units, is an error of the integrator.
     RESOLVED: ClassVar[float] = 1e3
     #: Time before which steps do not end at extrema, unless a stick phase has ended: about two
     #: loops, which are transient in nearly every run.
     SETTLING: ClassVar[float] = 12.0
-    #: A spiral is slow if each move of the top is about the last one times a factor between these,
-    #: and larger than FAR times the amplitude: it takes 40 more until tops repeat.
+    #: A spiral is slow if the ratio of the last two moves of the top is between these and the move
+    #: is larger than FAR times the amplitude: it takes 40 more loops until tops repeat.
     SLOW: ClassVar[tuple[float, float]] = (0.8, 1.25)
     FAR: ClassVar[float] = 1e-3
-    #: Loops of a slow spiral in which steps do not end at tops.
+    #: Number of loops for which the steps of a slow spiral do not end at tops.
     ASLEEP: ClassVar[int] = 16
     #: Number of tops without a stick phase after which a run counts as one that no longer sticks.
     SMOOTH: ClassVar[int] = 2
@@ -178,10 +178,10 @@ class Attractor(Observer):
         mark = loop.mark
         slow = self._is_slow(loop, change, seen)
         sleeps = materialise(top & (tops > self.SMOOTH) & ~found & slow, ones)
-        # Where the orbit comes back and is not yet settled, the next loop is compared with this
-        # one.
+        # An orbit that is back at its mark but not settled gets a new mark, so that the next loop
+        # is compared with this one.
         renewed, new = mark.renewed(lanes, section & ~found, lanes.events, ones, met)
-        # An attractor at rest is a point; a new mark begins a new loop.
+        # Extrema are reset: an attractor at rest is a point, and a new mark begins a new loop.
         fresh = new | resting
         asleep = self.ASLEEP * (lanes.t - loop.previous_t)
         memory = _LoopSoFar(
@@ -222,10 +222,10 @@ class Attractor(Observer):
     def _kind(
         self, loop: _LoopSoFar, lanes, passage, section, released, change, tol
     ) -> tuple[Array, Array]:
-        """Whether the lanes are back at their marks, and the kind that they lead to.
+        """Mask of lanes that are back at their marks, and kinds of attractors found, [lanes].
 
-        section: lanes in a state to compare with marks; released: those at the end of a stick
-        phase; change: of x1 since the last top.
+        section: lanes in a state to compare with their marks; released: lanes at the end of a stick
+        phase; change: change of x1 since the last top.
         """
         amplitude = loop.x1_max - loop.x1_min
         left = way_left(change, loop.change)
@@ -233,7 +233,7 @@ class Attractor(Observer):
         # A top may drift with moves below the tolerance, each a little smaller than the last one.
         on_its_way = (change * loop.change > 0) & (moved * left < amplitude)
         stands = (moved < self.STANDS * tol * amplitude) & ~on_its_way
-        # The moves of a slow spiral around a pseudo-focus shrink like the square of its size.
+        # Around a pseudo-focus the moves of a slow spiral shrink like the square of its size.
         converged = (moved * left <= close) | stands & (amplitude > jnp.sqrt(tol))
         exact = self.EXACT * amplitude
         met = section & loop.mark.met_by(lanes, jnp.where(released, exact, close))
@@ -270,7 +270,7 @@ class Attractor(Observer):
             lanes,
             lower=jnp.where(found, 0.0, lanes.lower),
             upper=jnp.where(found, 0.0, lanes.upper),
-            # An orbit that stays there up to rounding would do so until t1: it remains undecided.
+            # An orbit at a repelling equilibrium up to rounding would stay until t1: undecided.
             done=lanes.done | found | (lost & slips),
             memory=memory,
         )
@@ -285,7 +285,7 @@ class Attractor(Observer):
         word = jnp.where(jnp.isinf(loop.word), -1.0, loop.word)
 
         def of_attractor(value):
-            """NaN where there is no attractor: the loop of an undecided run is none."""
+            """The value, or NaN where the run is undecided: its last loop is no attractor."""
             return jnp.where(undecided, jnp.nan, value)
 
         return {

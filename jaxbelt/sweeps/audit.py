@@ -1,4 +1,4 @@
-"""Audits of sweeps: some runs again without any shortcut, and compared.
+"""Audits of sweeps: some runs are repeated without shortcuts, and the results compared.
 
 The kernel of `queue` has three shortcuts: a run of final states skips loops once it has seen one
 repeat; a run that looks for its attractor ends as soon as it knows it; and a run that is captured
@@ -24,9 +24,9 @@ from .observers import Final
 from .runs_in_memory import results_of
 from .threads import CHUNK
 
-#: Largest difference of states and extrema, in tolerances of a step: errors add up over a run.
+#: States and extrema agree up to so many tolerances of a step: errors add up over a run.
 AUDIT_CLOSE = 1e4
-#: Share of the usual budget of steps for audited runs, which no pseudo-focus ends.
+#: Share of `STEP_BUDGET` that an audited run may take, as no pseudo-focus ends it early.
 LONG_WAY_BUDGET = 0.025
 
 Results = dict[str, np.ndarray]
@@ -47,11 +47,11 @@ def differing(
     numbers: dict[str, Any],
     length: float,
 ) -> np.ndarray:
-    """Numbers of the audited runs that differ without shortcuts.
+    """Numbers of the audited runs whose results differ without shortcuts.
 
-    rows_of(runs): the kernel's rows of some runs, [columns, runs]; known: results of the sweep for
-    the audited runs, a row each, in the form of the kernel's results; length: own unit of length of
-    the oscillators.
+    rows_of(runs): the kernel's rows of some runs, [columns, runs]; known: the sweep's results
+    for the audited runs by name, a row for each run; numbers: those of its `Question`; length: own
+    unit of length of the oscillators.
     """
     atol = numbers["rtol"] * length if numbers["atol"] is None else numbers["atol"]
     close = functools.partial(_close, atol=atol, rtol=numbers["rtol"])
@@ -84,7 +84,7 @@ def _close(a: np.ndarray, b: np.ndarray, *, atol: float, rtol: float) -> np.ndar
 
 
 def _same_ends(known: Results, final: Results, close: Callable, captured: Callable) -> np.ndarray:
-    """Whether final states agree: to the tolerance, or within the reach of a pseudo-focus."""
+    """Mask of runs whose ends agree: to the tolerance, both not finite, or near a pseudo-focus."""
     same = (known["n_events"] == final["n_events"]) & (known["status"] == final["status"])
     same &= np.all(known["mode_end"] == final["mode_end"], axis=1)
     for name in ("x1_end", "x2_end"):
@@ -94,7 +94,7 @@ def _same_ends(known: Results, final: Results, close: Callable, captured: Callab
 
 
 def _captured(x1: np.ndarray, known: Results, final: Results, *, within: float) -> np.ndarray:
-    """Whether a run that a pseudo-focus at x1 ended stays there without the shortcut."""
+    """Mask of runs that ended at a pseudo-focus at x1 and stay there without the shortcut."""
     distance = np.hypot(final["x1_end"] - x1, final["x2_end"])
     return (known["status"] == Status.PSEUDO_FOCUS) & (distance <= within)
 
@@ -102,7 +102,7 @@ def _captured(x1: np.ndarray, known: Results, final: Results, *, within: float) 
 def _same_attractors(
     known: Results, final: Results, again: Results, close: Callable, captured: Callable
 ) -> np.ndarray:
-    """Whether attractors agree, each with its place. Undecided ones claim nothing."""
+    """Mask of runs whose attractors agree in kind, place and events; undecided ones always do."""
     decided = (known["kind"] != UNDECIDED) & (again["kind"] != UNDECIDED)
     same = known["kind"] == again["kind"]
     for name in ("x1_min", "x1_max", "x2_min", "x2_max"):

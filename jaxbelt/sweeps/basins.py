@@ -56,12 +56,12 @@ if TYPE_CHECKING:
 
 #: Columns of the table of basins that only cycles have.
 OF_CYCLES = ("x1_min", "x1_max", "x2_min", "x2_max", "period", "multiplier")
-#: And those of periodic motions.
+#: Columns of the table of basins that only periodic motions of forced oscillators have.
 OF_MOTIONS = ("periods", "period", "x1", "x2", "multiplier_0", "multiplier_1")
 
 
 class BasinEntropy(NamedTuple):
-    """Basin entropy: over all boxes, and over those with a boundary in them."""
+    """Basin entropy: mean over all boxes, and over boxes with more than one label."""
 
     basins: float
     boundary: float
@@ -76,8 +76,8 @@ class Basins(eqx.Module):
             observe="attractor")`, and `label`, the number of the attractor, from 0, the most
             frequent first (-1: undecided).
         attractors: A few words for each label.
-        cycles: Those of the attractors that are cycles, in the same order; of a forced oscillator
-            each is a `PeriodicMotion`.
+        cycles: The cycles among the attractors, in the same order; of a forced oscillator each is a
+            `PeriodicMotion`.
         boundary: The unstable cycle, with the status NO_UNSTABLE_CYCLE where there is none; None
             for a forced oscillator.
     """
@@ -94,7 +94,7 @@ class Basins(eqx.Module):
         return self.dataset["label"]
 
     def entropy(self, side: int | tuple[int, int]) -> BasinEntropy:
-        """Basin entropy: how little a start that is known to a box says about its attractor.
+        """Basin entropy: how uncertain the attractor of a start is if only its box is known.
 
         In a box in which the shares p_j of the starts lead to the attractors j the entropy is -sum
         p_j log p_j, with natural logarithms. The basin entropy S_b is its mean over all boxes, the
@@ -222,7 +222,7 @@ class Basins(eqx.Module):
         return f"Basins({labels.shape[0]} x {labels.shape[1]} starts: {', '.join(parts)})"
 
 
-#: States of a cycle that are joined by straight lines.
+#: Number of samples of a cycle, which straight lines join.
 CHORDS = 4000
 
 
@@ -232,7 +232,7 @@ def _away_from_cycle(cycle: Any, states: np.ndarray) -> np.ndarray:
 
     if int(cycle.status) != Status.OK:
         return np.full(max(1, len(states)), np.nan)
-    # The last of the samples is the first one.
+    # The last sample repeats the first one.
     points = np.asarray(cycle.sample(CHORDS))[:-1]
     nearest = KDTree(points).query(states)[1]
     away = np.full(len(states), np.inf)
@@ -314,17 +314,17 @@ def basins(
 ) -> Basins:
     """Labels a grid of starts by their attractors, and finds the unstable cycle between them.
 
-    Of a forced oscillator the starts are at the time t0, and nothing is looked for between the
-    basins, which may have fractal boundaries. Its attractors are periodic motions, by their number
-    of periods of the forcing, chaotic and quasiperiodic ones; all of these last two are one label
-    each.
+    Starts of a forced oscillator are at the time t0, and no unstable cycle is searched for, as the
+    basins may have fractal boundaries. Its attractors are periodic motions, named by their number
+    of periods of the forcing, and chaotic and quasiperiodic motions; all chaotic motions have one
+    label, and all quasiperiodic ones another.
 
     Args:
         oscillator: The oscillator.
         x1: Displacements of the starts, increasing, [n], dimensionless.
         x2: Velocities of the starts, increasing, [m], dimensionless.
-        t1: Time at which a run that has reached no attractor is given up; of one that is forced its
-            exponent then decides.
+        t1: Time at which a run ends that has reached no attractor; for a forced oscillator the
+            run's largest exponent then decides.
         t0: Time of the starts, for a forced oscillator.
         rtol: Relative tolerance of a step, as in `sweep`.
         atol: Absolute tolerance of a step, as in `sweep`.
@@ -351,8 +351,8 @@ def basins(
             dataset = sweep(lambda: oscillator, axes, observe="attractor", **numbers)
         note_progress("telling the attractors apart")
         found = _labels(oscillator, dataset)
-        # With one attractor there is hardly an unstable cycle, and a search among all cycles takes
-        # time.
+        # With one attractor an unstable cycle is unlikely, and `unstable_cycle`, which searches all
+        # cycles, takes time.
         boundary = (unstable_cycle if len(found) > 1 else from_starts)(own)
         boundary = in_given_units(boundary, oscillator, own)
     cycles = [in_given_units(one.cycle, oscillator, own) for one in found if one.cycle is not None]
@@ -375,7 +375,7 @@ def _labelled(
     cycles: Sequence[Any],
     boundary: Cycle | None,
 ) -> Basins:
-    """The basins of the attractors that were found, the most frequent first."""
+    """Labels the dataset by the attractors, the most frequent first, and makes the `Basins`."""
     labels = np.full(dataset["kind"].shape, -1, "int32")
     for i, one in enumerate(found):
         labels[one.runs] = i
@@ -426,19 +426,19 @@ def _labels(osc: Oscillator, dataset: "xarray.Dataset") -> list[Found]:
     return told_apart(kinds, of_run)
 
 
-#: Runs end no farther from the equilibrium that captures them, in own units.
+#: Largest distance of the end of a run from the equilibrium that captures it, in own units.
 NEAR_REST = 1e-2
 
 
 def rest_reached(osc: Oscillator, x1: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Equilibria that runs have come to.
+    """Equilibria, and segments of equilibria, near which runs have ended.
 
-    A run ends near its equilibrium; where none is near, x1 of the run itself is returned. A segment
-    across an edge is in pieces.
+    x1: where runs have ended, any shape. Where no equilibrium is near, x1 itself is returned,
+    rounded to `NEAR_REST`. Pieces of a segment across a contact edge are joined.
 
     Returns:
-        x1 of the equilibria, the numbers of their segments, and the ends of all segments,
-        [segments, 2].
+        x1 of the equilibrium of each run, the number of the segment nearest to each run, and the
+        ends of all segments, [segments, 2].
     """
     own = in_own_units(osc)
     length = 1.0 if own is osc else float(own.units.length)
@@ -483,7 +483,7 @@ def basin_stability(
         box: ((x1 from, to), (x2 from, to)), dimensionless.
         n: Number of starts, drawn uniformly.
         key: Random key, from `jax.random.key`.
-        t1: Time at which a run that has reached no attractor is given up.
+        t1: Time at which a run ends that has reached no attractor.
         t0: Time of the starts, for a forced oscillator.
         rtol: Relative tolerance of a step, as in `sweep`.
         atol: Absolute tolerance of a step, as in `sweep`.
@@ -533,6 +533,6 @@ def check_key(key: Any) -> None:
 
 
 def _kinds(osc: Oscillator, starts: np.ndarray, **numbers: Any) -> np.ndarray:
-    """Numbers of the kinds of attractors for starts [2, n], in the order of the starts."""
+    """Codes of the kinds of attractors for starts [2, n], in the order of the starts."""
     observer = ForcedAttractor() if has_clock(osc) else Attractor()
     return results_from(in_units_of_run(osc), observer, starts, **numbers)["kind"].astype(int)

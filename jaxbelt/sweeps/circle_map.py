@@ -1,9 +1,9 @@
 """Circle maps of sticking motions: from the phase of one slip onset to that of the next.
 
-At slip onset x2 is the belt's velocity, and x1 follows from needed = +-capacity: what is left of
-the state is the phase of the clock. So the motions of a forced oscillator that stick are orbits of
-a map of the circle. One sweep follows an onset at each of many phases to the next one at the same
-belt and limit, with the tangent along it, from which the map's slope follows. The map jumps where a
+At slip onset x2 is the belt's velocity, and x1 follows from needed = +-capacity: the phase of the
+clock determines the whole state. So the sticking motions of a forced oscillator are orbits of a map
+of the circle. One sweep follows an onset at each of many phases to the next one at the same
+belt and limit, with a tangent along the run, which gives the map's slope. The map jumps where a
 stick phase is skipped, and its slope is singular beside a jump. Its fixed points are periodic
 motions, which `periodic` solves for.
 """
@@ -49,20 +49,20 @@ from .runs_in_memory import results_from
 if TYPE_CHECKING:
     import pandas
 
-#: Parts into which an interval is cut in which the map changes much; and one with a fixed point,
-#: and how often: to 1e-6 of itself.
+#: Parts into which an interval is cut where the map changes much; parts into which one with a fixed
+#: point is cut, and how often: to 1e-6 of its length.
 PARTS_OF_INTERVAL, PARTS_OF_CUT, CUTS = 32, 4, 10
-#: Where the periods to the next onset differ by more from one phase to the next, or one of the two
-#: leads nowhere, fixed points are searched between finer phases.
+#: Intervals over which the periods to the next onset change by more than this, or at one end of
+#: which no onset follows, are searched for fixed points with finer phases.
 ROUGH = 0.02
-#: States at onset are computed for so many phases at least.
+#: Smallest number of phases for which onset states are computed, so that few shapes are compiled.
 FEWEST_PHASES = 1024
-#: Where the map is continuous its rise over an interval that was cut so often is a smaller part of
-#: what it was, even beside a square root; where it jumps it is not.
+#: The rise of the map over the last interval around a fixed point is below this part of its rise
+#: over the first one where the map is continuous, even beside a square root, not where it jumps.
 STILL_RISES = 0.1
-#: Longest step with a tangent: the slopes are then good to some 1e-7 of themselves.
+#: Longest step with a tangent: slopes then have relative errors of some 1e-7.
 LONGEST_WITH_TANGENT = 0.1
-#: The onset of a motion that was solved for is in the interval up to this phase.
+#: The onset of a solved motion has to lie in its interval up to this phase.
 SAME_PHASE = 1e-6
 
 
@@ -71,19 +71,19 @@ class CircleMap(eqx.Module):
 
     Attributes:
         phases: Phases of the clock, evenly spaced in [0, 2 pi), [n].
-        elapsed: Times from an onset at each of them to the next one (by `iterate` to a later one),
-            [n]; NaN where no onset is at this phase, or none follows.
+        elapsed: Times from an onset at each phase to the next one (the `iterate`-th next one), [n];
+            NaN where no onset can be at this phase, or none follows.
         slopes: Derivatives of the map, [n].
-        is_onset: At which phases a stick phase can end at this limit, [n].
-        fixed_points: Phases that the map leads back to, increasing.
+        is_onset: Whether a stick phase can end at this limit, for each phase, [n].
+        fixed_points: Phases that the map takes to themselves, increasing.
         motions: The periodic motion of each of them.
-        unsolved: Phases at which the map has a fixed point, too, by the signs beside it, for which
-            Newton's method found no motion.
+        unsolved: Phases of further fixed points, found by a change of sign, for which Newton's
+            method found no motion.
         period: Period of the clock.
         belt: Number of the belt.
         limit: 1 where needed = capacity at the onsets, so that the mass runs ahead of the belt, -1
             where needed = -capacity, and it falls behind.
-        iterate: How many onsets later the next one is.
+        iterate: k, where the map leads to the k-th next onset.
     """
 
     phases: np.ndarray
@@ -105,7 +105,7 @@ class CircleMap(eqx.Module):
 
     @property
     def periods(self) -> np.ndarray:
-        """How often the clock passes the phase 0 until then, [n]."""
+        """How often the clock passes the phase 0 before the next onset, [n]."""
         return self._lift // (2 * np.pi)
 
     @property
@@ -114,8 +114,8 @@ class CircleMap(eqx.Module):
 
     @property
     def multipliers(self) -> np.ndarray:
-        """The multiplier of each motion that is not 0: the slope of the map there, or of the first
-        of its iterates that leads back."""
+        """Of each motion the multiplier that is not 0: the slope of the first iterate of the map
+        that takes its phase to itself."""
         return np.array([float(one.multipliers[0].real) for one in self.motions])
 
     @property
@@ -126,9 +126,9 @@ class CircleMap(eqx.Module):
     def table(self) -> "pandas.DataFrame":
         """Returns a row for each phase and each fixed point, by phase.
 
-        Columns: phase, next_phase, periods (how often the clock passes the phase 0 until then; of a
-        fixed point those of its motion), slope (of a fixed point its multiplier), is_onset,
-        fixed_point. NaN where no onset follows.
+        Columns: phase, next_phase, periods (how often the clock passes the phase 0 before the next
+        onset; of a fixed point those of its motion), slope (of a fixed point its multiplier),
+        is_onset, fixed_point. NaN where no onset follows.
         """
         fixed = np.repeat([False, True], [len(self.phases), len(self.motions)])
         columns = {
@@ -192,8 +192,8 @@ def circle_map(
     clock, 2 pi t / T, T the common period of all forces, velocities and loads. Fixed points are
     motions that repeat after one onset; they are searched where the map crosses the diagonal
     between two of the n phases, or, where it is steep or jumps, between phases a thirty-second of
-    that apart. So a pair of them nearer to one another is missed, and so are most of those in an
-    accumulation of jumps.
+    that apart. So two fixed points nearer to one another are missed, and so are most of those
+    where jumps accumulate.
 
     Args:
         osc: An `Oscillator` with forcing.
@@ -204,8 +204,8 @@ def circle_map(
         iterate: With k the map is taken to the k-th next onset: its fixed points are then motions
             that repeat after k onsets, too, each at k phases.
         n: Number of phases, evenly spaced, 0 among them.
-        periods: After how many periods, 32 at most, a motion that has not come to an onset is given
-            up.
+        periods: Number of periods, 32 at most, within which the next onset has to follow; else
+            `elapsed` is NaN.
         rtol: Relative tolerance of a step.
         atol: Absolute tolerance of a step; None: 1e-8 of the oscillator's own size.
 
@@ -214,8 +214,8 @@ def circle_map(
 
     Raises:
         ValueError: If an argument is impossible; if the frequencies have no common period; if the
-            contact of another belt begins or ends within that of this one, as x1 would then not
-            follow from the phase.
+            contact interval of another belt begins or ends within that of this one, as x1 would
+            then not follow from the phase.
 
     Example:
         found = jb.circle_map(jb.presets.di_bernardo(1.68))
@@ -263,13 +263,13 @@ def circle_map(
 
 
 def _touches_wherever(osc: Oscillator, i: int, belt: int) -> Any:
-    """Whether belt i touches wherever the belt does."""
+    """Whether belt i touches the mass wherever belt `belt` does."""
     ends, n = edges(osc), len(osc.belts)
     return (ends[i] <= ends[belt]) & (ends[n + i] >= ends[n + belt])
 
 
 def _keeps_off(osc: Oscillator, i: int, belt: int) -> Any:
-    """Whether belt i touches nowhere where the belt does."""
+    """Whether belt i touches the mass nowhere where belt `belt` does."""
     ends, n = edges(osc), len(osc.belts)
     return (ends[i] >= ends[n + belt]) | (ends[n + i] <= ends[belt])
 
@@ -301,9 +301,9 @@ def _onset_states(osc: OwnOscillator, belt: int, limit: Array, t: Array) -> Arra
 class _ToNextOnset(eqx.Module):
     """Memory of the observer, arrays [lanes].
 
-    growth: the tangent, by the time of the first onset; sign: of the slip that begins with it, 0
-    where none does; elapsed: until the next one, NaN before it; slope: how much later that is, for
-    each unit of time that the first is later.
+    growth: the tangent, the derivative of the state by the time of the first onset; sign: sign of
+    the slip that begins there, 0 where none begins; elapsed: time from the first onset to the next,
+    NaN before that; slope: derivative of the time of the next onset by that of the first.
     """
 
     growth: Growth
@@ -313,9 +313,9 @@ class _ToNextOnset(eqx.Module):
 
 
 class NextOnset(Observer):
-    """From a slip onset to the next one at the same belt and limit, where the run ends.
+    """Observer of a run from a slip onset to the next one at the same belt and limit, its end.
 
-    Steps are short, for the tangent is known to a lower order than the state.
+    Steps are short, because the tangent is integrated with a lower order than the state.
     """
 
     variables: ClassVar[Mapping[str, Variable]] = {
@@ -331,7 +331,7 @@ class NextOnset(Observer):
         sign = jnp.where(jnp.abs(code) == 1, code, 0.0)
 
         def tangent(osc, mode, sign, t):
-            """How the state at a fixed time changes with that of the onset."""
+            """Derivative of the state at a fixed time by the time of the onset."""
             one = jnp.ones_like(t)
             y, moved = jax.jvp(lambda t: _onset_state(osc, self.belt, -sign, t), (t,), (one,))
             rates = field_at(osc, mode, (*y, t))
@@ -385,7 +385,7 @@ class NextOnset(Observer):
 
 @dataclass(frozen=True, eq=False)
 class _Mapping:
-    """The map of a known oscillator in its own units; numbers: tolerances of its sweep."""
+    """The map of an oscillator in own units. turns: `common_turns`; numbers: rtol and atol."""
 
     own: OwnOscillator
     turns: int
@@ -401,14 +401,14 @@ class _Mapping:
         return float(forcing_period(self.own, self.turns))
 
     def states(self, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Times in the first period, and the states at onset there, [2, n]."""
+        """Times of the phases in the first period, [n], and the onset states then, [2, n]."""
         t, limit = phases / (2 * np.pi) * self.period, jnp.asarray(float(self.limit))
-        # A power of two of them, for few programs.
+        # Padded to a power of two, so that few shapes are compiled.
         padded = jnp.asarray(np.resize(t, power_of_two(len(t), FEWEST_PHASES)))
         return t, np.asarray(_onset_states(self.own, self.belt, limit, padded))[:, : len(t)]
 
     def of_phases(self, phases: np.ndarray) -> dict[str, np.ndarray]:
-        """turns: periods from onsets at phases to the next ones; slope and is_onset, [n]."""
+        """For onsets at phases, [n] each: turns, the periods to the next onset; slope; is_onset."""
         whole = self._once(phases)
         for _ in range(self.iterate - 1):
             found = self._once((phases + 2 * np.pi * whole["turns"]) % (2 * np.pi))
@@ -430,13 +430,13 @@ class _Mapping:
     def fixed_points(
         self, phases: np.ndarray, turns: np.ndarray
     ) -> tuple[np.ndarray, list[PeriodicMotion], np.ndarray]:
-        """Phases in order, their motions, and phases of fixed points without one."""
+        """Phases of fixed points in order, their motions, and phases of unsolved ones."""
         found: list[tuple[float, PeriodicMotion]] = []
         unsolved = []
         ends = (np.append(phases, 2 * np.pi), np.append(turns, turns[0]))
         ends = [np.stack([one[:-1], one[1:]], axis=1) for one in ends]
         known = np.isfinite(ends[1])
-        # A branch may begin or end behind a fixed point and before the next phase.
+        # A branch of the map may begin or end between a fixed point and the next phase.
         rough = np.any(known, axis=1) & ~(np.abs(np.ptp(ends[1], axis=1)) <= ROUGH)
         parts = (
             _crossings(*(one[~rough] for one in ends)),
@@ -466,10 +466,10 @@ class _Mapping:
     def _between(
         self, ends: np.ndarray, values: np.ndarray, parts: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Phases from low to high ones, and periods from them to the next onsets.
+        """Phases that cut intervals into equal parts, and the periods to the next onsets.
 
-        ends, values: the same of the low and the high ones, [rows, 2]. Both have the shape
-        [rows, parts + 1].
+        ends, values: phases and periods at both ends of the intervals, [rows, 2]. Returns two
+        arrays [rows, parts + 1].
         """
         shares = np.arange(parts + 1) / parts
         places = ends[:, :1] + (ends[:, 1:] - ends[:, :1]) * shares
@@ -477,8 +477,8 @@ class _Mapping:
         return places, np.concatenate([values[:, :1], inner, values[:, 1:]], axis=1)
 
     def _motion(self, phase: float, periods: int) -> tuple[PeriodicMotion | None, np.ndarray]:
-        """The motion that repeats after so many periods near an onset at a phase, and the phases of
-        its onsets; None where there is none."""
+        """The motion that repeats after `periods` periods near an onset at `phase`, or None, and
+        the phases of its onsets at the belt and limit."""
         (t,), states = self.states(np.array([phase]))
         cuts = self.period * np.arange(1, PERIODS_AT_ONCE + 1)
         run = simulate(self.own, states[:, 0], cuts[-1], t0=t, ts=cuts)
@@ -493,15 +493,15 @@ class _Mapping:
         ends = np.asarray(motion.chain.ends)[used] == Ends(len(self.own.belts)).onset
         here = ends & (codes == STUCK) & (np.roll(codes, -1) == -self.limit)
         onsets = 2 * np.pi * np.roll(np.asarray(motion.unknowns)[used, 2], -1)[here] / self.period
-        # A motion with fewer onsets repeats after fewer periods.
+        # A motion with fewer onsets than `iterate` repeats after proportionally fewer periods.
         fits = motion.periods * self.iterate == periods * len(onsets)
         return (motion, onsets) if fits else (None, onsets)
 
 
 def _crossings(phases: np.ndarray, turns: np.ndarray, counts: Any = None) -> list[np.ndarray]:
-    """The intervals between phases, [rows, k], in which the time to the next onset passes a whole
-    number of periods: both ends, the times there, these numbers, and rows. counts: the numbers that
-    are asked for, [rows]; None: all."""
+    """Intervals between phases, [rows, k], in which `turns` passes a whole number of periods:
+    phases at both ends, turns there, that number, and the row. counts: the only whole number to
+    look for in each row, [rows]; None: all."""
     before, after = turns[:, :-1], turns[:, 1:]
     known, found = np.isfinite(before) & np.isfinite(after), []
     for m in range(1, PERIODS_AT_ONCE + 1):

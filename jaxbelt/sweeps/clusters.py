@@ -29,12 +29,12 @@ from .work import Advance, counts, do_runs
 RETRIES = 2
 #: How often a block is submitted again that Dask gave up, because several workers died with it.
 RESUBMISSIONS = 3
-#: Resource of workers by this name; where workers have it, blocks go to no others.
+#: Name of a Dask resource; where any worker has it, blocks go only to workers that have it.
 GPU = "GPU"
 
 
 def check_executor(executor: Any) -> None:
-    """Raises unless it is a client that can be waited for."""
+    """Raises a `ValueError` unless `executor` is a client that is not asynchronous."""
     methods = ("submit", "scheduler_info", "cancel", "asynchronous")
     fits = all(hasattr(executor, name) for name in methods) and not executor.asynchronous
     require_value(fits, "executor", "a dask.distributed.Client (not asynchronous)", executor)
@@ -43,7 +43,7 @@ def check_executor(executor: Any) -> None:
 def do_on_cluster(client: Any, question: Question, store: Store, advance: Advance) -> None:
     """Does the blocks that the store lacks on the workers of a cluster.
 
-    advance is called with the numbers of further runs by status. Workers may come and go.
+    advance is called with the numbers of newly done runs by status. Workers may come and go.
     """
     import cloudpickle
     from distributed import KilledWorker, as_completed
@@ -100,7 +100,7 @@ def do_block(packed: bytes, place: str, block: int) -> dict[str, Any]:
         if stopped():
             raise RuntimeError("the sweep was interrupted")
 
-    # For this thread of the worker only.
+    # x64 for this thread of the worker only.
     with jax.enable_x64(True):
         question, store = _opened(packed, place)
         store.read_rows(block)
@@ -113,8 +113,8 @@ def do_block(packed: bytes, place: str, block: int) -> dict[str, Any]:
 
 @functools.lru_cache(maxsize=4)
 def _opened(packed: bytes, place: str) -> tuple[Question, Store]:
-    """The question and its store, once for each worker: the kernel is compiled for this
-    question."""
+    """The question and its store, cached in each worker, so that the kernel is compiled once for
+    them."""
     arguments, known = pickle.loads(packed)
     question = Question.of(*arguments)
     return question, Store(Path(place), question, known=known)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 #: Dimensions of the axes of starts.
 DIMENSIONS_OF_STARTS = {"x1": "length", "x2": "velocity"}
-#: Words for axes; other arguments of `make` go by their own name.
+#: Long names of axes; other arguments of `make` go by their own name.
 AXIS_NAMES = {
     "nu0": "velocity of belt 0",
     "nu1": "velocity of belt 1",
@@ -71,7 +71,7 @@ def decoded(dataset: "xarray.Dataset") -> "xarray.Dataset":
 
 
 def check_dataset(dataset: Any) -> None:
-    """Raises unless it is an `xarray.Dataset`, or behaves like one."""
+    """Raises a `ValueError` unless `dataset` is, or behaves like, an `xarray.Dataset`."""
     fits = all(hasattr(dataset, name) for name in ("data_vars", "dims", "assign"))
     require_value(fits, "dataset", "an xarray.Dataset, such as sweep(...) returns", dataset)
 
@@ -88,7 +88,7 @@ def words_of(values: np.ndarray, attributes: dict[str, Any]) -> np.ndarray:
 def variable_of(
     name: str, described: Mapping[str, Variable], derivatives: Iterable[str]
 ) -> Variable:
-    """Description of a variable that an observer describes, of a derivative of one, or of neither.
+    """Description of a variable: an observer's own, a derivative of one, or else its name only.
 
     The dimension of a derivative is "velocity / length", say, or "length / unit of nu0".
     """
@@ -106,7 +106,7 @@ def variable_of(
 
 
 def flags(meanings: Mapping[int, str], dtype: str) -> dict[str, Any]:
-    """CF's attributes of a category."""
+    """Attributes of a category by the CF conventions: its values and their words."""
     return {
         "flag_values": np.array(list(meanings), dtype),
         "flag_meanings": " ".join(name.replace(" ", "_") for name in meanings.values()),
@@ -121,8 +121,8 @@ def _not_done(meanings: Mapping[int, str]) -> int:
 class Table:
     """The variables of a sweep: their order, shapes, types and attributes.
 
-    layout: shapes of the kernel's results, by name; shapes: those of all variables, with
-    derivatives.
+    layout: shapes of the kernel's results of one run, by name; shapes: the same for all variables,
+    derivatives among them.
     """
 
     def __init__(self, program: Program, grid: Grid, derivatives: tuple[str, ...]):
@@ -159,7 +159,7 @@ class Table:
         return variable_of(name, self.described, self.derivatives)
 
     def empty(self, name: str) -> Any:
-        """Placeholder for results that are not there yet."""
+        """Placeholder for the results of runs that are not done."""
         variable = self.variable(name)
         dtype = np.dtype(variable.dtype)
         return dtype.type(_not_done(variable.meanings) if variable.meanings else 0)
@@ -176,7 +176,7 @@ class Table:
                 found[name] = (np.nan_to_num(part) if exact else part).astype(dtype)
         for i, by in enumerate(self.derivatives):
             found |= {
-                # NaN has no derivative; the kernel has that of a constant, 0.
+                # Where the value is NaN the kernel returns the derivative of a constant, 0.
                 f"d_{name}_d_{by}": np.where(np.isfinite(of[0]), of[i + 1], np.nan)
                 for name, of in values.items()
                 if f"d_{name}_d_{by}" in self.shapes
@@ -191,7 +191,7 @@ class Table:
         return (*self.grid.axes, *extra)
 
     def attributes(self, name: str) -> dict[str, Any]:
-        """Attributes of a variable, without the flags of categories that are numbered."""
+        """Attributes of a variable; `numbering` adds those of categories that are numbered."""
         variable = self.variable(name)
         attributes: dict[str, Any] = {"long_name": variable.long_name}
         if variable.dimension:
@@ -212,7 +212,7 @@ class Table:
         return {name: (name, values, attributes[name]) for name, values in axes.items()}
 
     def numbered(self) -> list[str]:
-        """Variables whose categories are numbered when all runs are known."""
+        """Variables whose categories are numbered when all runs are done."""
         return [name for name in self.shapes if self.variable(name).name_of is not None]
 
     @property
@@ -233,14 +233,14 @@ class Table:
         return numbered({code: name_of(code, belts) for code in codes})
 
 
-#: Categories that come first where they are numbered.
+#: Names of categories that get the first numbers.
 FIRST_NAMES = ("none", "smooth")
-#: Type of categories that are numbered.
+#: Integer type of the numbers of such categories.
 NUMBERED = "int16"
 
 
 def numbered(names: Mapping[int, str]) -> tuple[dict[int, int], dict[str, Any]]:
-    """Numbers for categories whose codes have these names, and the attributes that name them."""
+    """A number for each code, in the order of the names, and the attributes that name them."""
     ordered = sorted(set(names.values()), key=_rank_of)
     number = {name: i for i, name in enumerate(ordered)}
     numbers = {code: number[name] for code, name in names.items()}
@@ -252,7 +252,7 @@ def _rank_of(name: str) -> tuple[Any, ...]:
 
 
 def renumber(codes: np.ndarray, numbers: dict[int, int]) -> np.ndarray:
-    """Numbers of categories for their codes."""
+    """Replaces codes of categories by their numbers, an array of the same shape."""
     different, place = np.unique(codes, return_inverse=True)
     return np.array([numbers[int(code)] for code in different], NUMBERED)[place].reshape(
         codes.shape
@@ -260,7 +260,7 @@ def renumber(codes: np.ndarray, numbers: dict[int, int]) -> np.ndarray:
 
 
 class Memory:
-    """Results of a sweep in memory; `Store` is the same in a file."""
+    """Results of a sweep in memory; `Store` has the same methods for results in a folder."""
 
     def __init__(self, table: Table):
         self.table, self.runs = table, table.grid.runs
@@ -271,7 +271,7 @@ class Memory:
         }
 
     def put(self, block: int, positions: np.ndarray, results: np.ndarray) -> None:
-        """Stores results of runs."""
+        """Keeps the results of the runs at some positions in a block."""
         for name, part in self.table.parts(results).items():
             self.arrays[name][positions] = part
 
@@ -293,7 +293,7 @@ class Memory:
 
     def dataset(self, attributes: dict[str, Any]) -> "xarray.Dataset":
         """The labelled results."""
-        import xarray  # with pandas, half of what `import jaxbelt` would take
+        import xarray  # late: with pandas, half the time of `import jaxbelt`
 
         table, variables = self.table, {}
         numbered = table.numbered()

@@ -1,8 +1,8 @@
 """Labels of starts by the attractors of a forced oscillator; see `basins.basins`.
 
-Runs lead to one periodic motion if Newton's method, from their states at a strobe, finds one; runs
-whose states are equal within their errors are asked once. Chaotic motions are one label together,
-and so are quasiperiodic ones: no number of theirs tells two of them apart.
+Runs lead to one periodic motion if Newton's method, from their states at a strobe, finds the same
+one; runs whose states agree within their errors share one call of it. All chaotic motions have one
+label, and all quasiperiodic ones another: no result of a run distinguishes two of them.
 """
 
 from typing import TYPE_CHECKING
@@ -21,9 +21,9 @@ from .naming import Found, told_apart, words_for
 if TYPE_CHECKING:
     import xarray
 
-#: The state at the strobe, and extents: where these agree runs lead to one motion.
+#: Extents and the state at the strobe: runs for which these agree lead to one motion.
 PLACES = ("x1_min", "x1_max", "x2_min", "x2_max", "x1_strobe", "x2_strobe")
-#: A motion is that of a run if its state at the strobe is this near, over its size.
+#: Largest distance at the strobe between a run and its motion, over the size of the motion.
 OF_RUN = 1e-3
 
 
@@ -51,8 +51,8 @@ def forced_labels(osc: Oscillator, dataset: "xarray.Dataset") -> list[Found]:
 
 
 def _motion_near(osc: Oscillator, place: np.ndarray, n: int) -> PeriodicMotion:
-    """The motion that a run has come to; with the status NO_CONVERGENCE where Newton's method leads
-    to none, or to another, or is not asked of so many periods."""
+    """The n-periodic motion that a run has come to; with the status NO_CONVERGENCE where Newton's
+    method finds none, or another one, or n exceeds `PERIODS_AT_ONCE`."""
     if n > PERIODS_AT_ONCE:
         return nothing_found(osc, turns_of(osc), Status.NO_CONVERGENCE.value)
     motion = periodic(osc, place[4:], periods=n)

@@ -46,12 +46,12 @@ MOVES = 0.25
 #: A cycle attracts if its multiplier is below 1 by more than this, which is beyond rounding.
 ATTRACTS = 1e-9
 #: Number of cycles without a stick phase that are examined at one value, those with most runs
-#: first: what is left after that is a continuum, with a run or two on each.
+#: first: cycles beyond these are a continuum, with a run or two on each.
 MOST_CYCLES = 50
-#: Smallest part of a step along the parameter in which an attractor is followed that moves too far.
+#: Smallest part of a parameter step by which an attractor that moves too far is followed.
 SMALLEST_PART = 1 / 64
-#: Where an attractor is: its smallest and largest x1 and x2; and the period of a loop. With the
-#: dimensions.
+#: Place of an attractor and its dimensions: smallest and largest x1 and x2, and the period of a
+#: loop.
 PLACE = EXTENT | {"period": "time"}
 
 
@@ -193,7 +193,7 @@ def basin_fractions(
         moves: How far an attractor may move from one value to the next, in x1 or x2. None: a
             quarter of the extent of the box and the attractors at all values, in x1 or x2,
             whichever is longer.
-        t1: Time at which a run that has reached no attractor is given up.
+        t1: Time at which a run ends that has reached no attractor.
         rtol: Relative tolerance of a step.
         atol: Absolute tolerance of a step; None: 1e-8 of the oscillator's own size.
 
@@ -211,7 +211,7 @@ def basin_fractions(
     given = varied(osc, where, (first,))
     instead = "jb.sweep with axes x1 and x2"
     refuse_clock(given.oscillator(np.array([first])), "basin_fractions", instead)
-    # The runs are those in own units.
+    # The runs are made in own units.
     variation = given.over(first, last)
     values = evenly_spaced(first, last, rows)
     starts = [starts_in(corners, n, jax.random.fold_in(key, row)) for row in range(rows)]
@@ -269,7 +269,7 @@ def _attractors_met(
 ) -> list[_Met]:
     """Attractors of the runs at a value, [1], the largest fraction first.
 
-    results: of the observer of attractors, [runs, ..].
+    results: the results of `Attractor` by name, [runs, ..] each.
     """
     # Codes of runs that are not finite are NaN.
     kinds = np.nan_to_num(results["kind"]).astype(int)
@@ -296,10 +296,10 @@ def _attractors_met(
 
 
 def _closed_only(osc: Oscillator, smooth: np.ndarray, runs: Runs) -> np.ndarray:
-    """Which runs end on a closed orbit that does not attract.
+    """Mask [runs] of runs that end on a closed orbit that does not attract.
 
-    smooth: runs that end on a cycle that does not stick (one that sticks attracts); a cycle that
-    was not examined counts as one that does not attract.
+    smooth: mask of runs that end on a cycle that does not stick (one that sticks attracts); a cycle
+    that was not examined counts as one that does not attract.
     """
     closed, remaining = np.zeros_like(smooth), smooth.copy()
     tops, reach = runs.places[:, 1], runs.error * np.ptp(runs.places[:, :4], axis=1)
@@ -321,7 +321,7 @@ def _closed_only(osc: Oscillator, smooth: np.ndarray, runs: Runs) -> np.ndarray:
 def _matched(
     found: list[list[_Met]], values: np.ndarray, moves: float, n: int, variation: Variation
 ) -> BasinFractions:
-    """The attractors at each value, matched with those before it."""
+    """The `BasinFractions` of attractors found at each value, matched from value to value."""
     names: list[str] = []
     last: list[_Met] = []  # the attractors, each where it was met last
     numbers: list[list[int]] = []  # for each value the numbers of its attractors in `names`
@@ -355,7 +355,7 @@ def _matched(
             places[:, row, number] = one.place
             if one.kind != CYCLE:
                 places[-1, row, number] = np.nan
-    # A multiple of 1/n: what is left is exact to rounding.
+    # Fractions are multiples of 1/n; rounding to these leaves no error of the sum.
     undecided = np.round(n * (1 - np.sum(fractions, axis=1))) / n
     columns = dict(zip(PLACE, places, strict=True))
     errors = standard_error(fractions, n)
@@ -393,10 +393,10 @@ def _followed_to(variation: Variation, way: np.ndarray, one: _Met, moves: float)
 
 
 def _seeded(osc: Oscillator, one: _Met) -> _Met | None:
-    """The attractor of an oscillator that is reached from one of another oscillator.
+    """The attractor of `osc` that continues the attractor `one` of another oscillator, or None.
 
-    A cycle is followed from the state in which it turns back; of points of rest the nearest is
-    taken.
+    A cycle is searched from the state (largest x1, 0) of the other one; of stable equilibria the
+    nearest is taken.
     """
     place = np.zeros(len(PLACE))
     if one.kind == CYCLE:
@@ -422,21 +422,21 @@ def _is_at(one: _Met, other: _Met) -> bool:
 
 
 def _partners(before: list[_Met], met: list[_Met], moves: float) -> dict[int, int]:
-    """Pairs attractors at one value with those before, see `basin_fractions`."""
+    """Pairs {index in met: index in before} of attractors, see `basin_fractions`."""
     from scipy.optimize import linear_sum_assignment  # late, as only this needs it
 
     if not before or not met:
         return {}
     far = np.array([[_move_between(one, other) for other in before] for one in met])
     fits = far <= moves
-    # A pair that does not fit costs more than all that do.
+    # A pair that does not fit costs more than all pairs that do.
     rows, columns = linear_sum_assignment(np.where(fits, far, 1 + moves * (1 + far.size)))
     pairs = zip(rows.tolist(), columns.tolist(), strict=True)
     return {i: j for i, j in pairs if fits[i, j]}
 
 
 def _move_between(one: _Met, other: _Met) -> float:
-    """Distance between two attractors, in x1 or x2; inf if they are of different kinds."""
+    """Largest change of the four extrema of x1 and x2; inf between different kinds."""
     if one.kind != other.kind:
         return np.inf
     return float(np.max(np.abs(one.place[:4] - other.place[:4])))

@@ -31,7 +31,7 @@ from ..model.own_units import in_units_of_run
 from ..numerics.compiling import jit, power_of_two
 from .runs_in_memory import results_of
 
-#: At least so many rows are made even for few runs, so that few shapes are compiled.
+#: Smallest number of rows computed at once, even for few runs: few shapes are compiled.
 FEWEST_ROWS = 2**14
 
 
@@ -60,8 +60,8 @@ class Grid:
         self.runs = math.prod(self.shape)
         self.names = [name for name in self.axes if name not in self.y0]
         check_arguments(make, self.names, "make", ", x1 or x2")
-        # One oscillator of the sweep, for the structure and for what does not vary. It raises for
-        # impossible values; runs that are not finite have a status.
+        # One oscillator of the sweep gives the tree structure and the leaves that do not vary; for
+        # impossible values `make` raises here. Other runs that are not finite only get a status.
         self.example = make(**self._first(np.isfinite))
         kind = type(self.example).__name__
         came = f"one that returns {kind}{its_oscillator(self.example, 'return')}"
@@ -73,7 +73,7 @@ class Grid:
         own = in_units_of_run(self.example, edges=True)
         self.mapped = traceable(self._varying, "make", returns)
         if len(self.mapped) != len(jax.tree.leaves(own)):
-            # A force of a frequency that is known to be 0 is a constant one, of another structure.
+            # A force whose frequency is a known 0 is a constant force, of another tree structure.
             self.example = make(**self._first(lambda values: np.isfinite(values) & (values != 0)))
             own = in_units_of_run(self.example, edges=True)
         alike = len(self.mapped) == len(jax.tree.leaves(own))
@@ -85,7 +85,7 @@ class Grid:
         self.mapped = self.mapped if self.edges else self._varying()
         pairs = zip(leaves, self.mapped, strict=True)
         self.shared = [jnp.asarray(leaf) for leaf, mapped in pairs if not mapped]
-        #: `rows` of all runs of a small grid, by derivatives.
+        #: Cache of `rows` for all runs of a small grid, by `derivatives`.
         self.known_rows: dict[tuple[str, ...], np.ndarray] = {}
 
     def _first(self, usable: Callable[[np.ndarray], np.ndarray]) -> dict[str, float]:
@@ -98,7 +98,7 @@ class Grid:
         found = []
 
         def probe(values):
-            # Leaves that do not depend on the mapped values are computed at once.
+            # Leaves that do not depend on the mapped values are concrete, not traced.
             run = in_units_of_run(self.make(**values), edges=self.edges)
             found.extend(not is_concrete(leaf) for leaf in jax.tree.leaves(run))
             return 0
@@ -114,8 +114,8 @@ class Grid:
     def results(
         self, observer: Observer, states: np.ndarray, which: np.ndarray, **numbers: Any
     ) -> dict[str, np.ndarray]:
-        """`results_of` runs from states (x1, x2) or (x1, x2, t), [2 or 3, runs]; which: the runs of
-        the grid whose parameters they have, [runs]."""
+        """`results_of` for runs from states (x1, x2) or (x1, x2, t), [2 or 3, runs], each with the
+        parameters of the grid's run number `which`, [runs]."""
 
         def rows_of(first: int, last: int) -> np.ndarray:
             rows = self.rows(which[first:last])

@@ -2,9 +2,9 @@
 
 - Along a slip arc a tangent d solves d1' = d2, d2' = -d1 + c(t) d2 with c the derivative of x2' by
   x2. Each half step is made by the exponential of Magnus's series of order four, with c at its ends
-  and in its middle; the trace of the matrix leaves the exponential and is added to the logarithm.
+  and in its middle; the trace of the matrix is left out of the exponential and added to `log`.
 - At an event d jumps by the saltation of the guard h that fires: d_tau = -(h_x d) / (h_t + h_x f-),
-  d+ = d + (f- - f+) d_tau, with the fields f before and behind. Behind a stick phase d2 = 0.
+  d+ = d + (f- - f+) d_tau, with the fields f- before and f+ behind. While the mass sticks d2 = 0.
 
 Magnus's series: S. Blanes, F. Casas, J. A. Oteo, J. Ros, Physics Reports 470, 2009, 151, sec. 5.
 """
@@ -32,18 +32,18 @@ from .moments import Course
 
 #: Tangents, (d1, d2) each.
 Tangents = tuple[tuple[Array, Array], ...]
-#: Share of a run before its exponent is measured.
+#: Share of a run that passes before its exponent is measured.
 UNMEASURED = 0.25
 
 
 class Growth(eqx.Module):
     """The tangent and the logarithms of its growth, arrays [lanes].
 
-    d1, d2: the tangent, of size one when it was last looked at; second: another one on the same
-    scale, (d1, d2), or None; log: the growth of the first by then; since,
-    before: the time at which the present block began, and `log` there; began: the time at which the
-    run did; blocks: how many are done, -1 before the first; total, squares: sums of the rates of
-    growth in them, and of their squares; sticks: whether the mass stuck since the first began.
+    d1, d2: the first tangent, normalised after each look at the events; second: another tangent on
+    the same scale, (d1, d2), or None; log: logarithm of the first one's growth, without its present
+    size; since, before: the time at which the present block began, and `log` then; began: start of
+    the run; blocks: number of blocks done, -1 before the first; total, squares: sums over blocks of
+    the rates of growth and of their squares; sticks: whether the mass stuck since the first block.
     """
 
     d1: Array
@@ -89,14 +89,14 @@ class Growth(eqx.Module):
         return replace(self, d1=d1, d2=d2, second=others[0] if others else None)
 
     def with_normal(self, flags: Array) -> "Growth":
-        """With a second tangent that is normal to the first, where a flag is."""
+        """The growth with a second tangent that is normal to the first, in lanes with a flag."""
         return replace(self, second=choose(flags, (-self.d2, self.d1), self.second))
 
     def multiplier_since(self, d1: Array, d2: Array, log: Array) -> tuple[Array, Array]:
-        """The logarithm of the size of the larger multiplier of the map of tangents, since the
-        second one was normal to the first, and whether both multipliers are complex.
+        """The logarithm of the modulus of the larger multiplier of the map of tangents since the
+        last call of `with_normal`, and whether the multipliers are complex.
 
-        d1, d2: the first tangent then, of size one; log: the `size` of its growth.
+        d1, d2: the first tangent at that call, of size one; log: its `size` then.
         """
         first, second = self.tangents
         scale = jnp.exp(self.log - log)
@@ -149,8 +149,8 @@ class LargestExponent(Observer):
 
 
 def grown(osc, growth: Growth, lanes: Lanes, course: Course, h: Array, ones) -> Growth:
-    """The tangent after a step of size h; along a slip arc the trace of the field is taken into the
-    logarithm."""
+    """The growth after a step of size h; along a slip arc the trace of the field is added to
+    `log`."""
     mode, tangents, log = lanes.mode, growth.tangents, growth.log
     along = jnp.where(mode.any_stuck, 0.0, h)
     rates = []
@@ -183,7 +183,7 @@ def grown(osc, growth: Growth, lanes: Lanes, course: Course, h: Array, ones) -> 
 
 
 def grown_past(osc, growth: Growth, lanes: Lanes, passage: Passage, t1: Array) -> Growth:
-    """The tangents behind the events that were passed, and their growth until now."""
+    """The growth behind the events of a passage: tangents jumped and normalised, `log` updated."""
     n, tangents = len(osc.belts), growth.tangents
     busy = lanes.run >= 0
     fired, released = passage.fired & busy, passage.released & busy
@@ -203,7 +203,7 @@ def grown_past(osc, growth: Growth, lanes: Lanes, passage: Passage, t1: Array) -
 
 
 def _counted(growth: Growth, t: Array, t1: Array) -> Growth:
-    """The tangent of size one, its growth in the logarithm, and the block ended that is over."""
+    """The growth with its first tangent normalised, and with the block closed that is over."""
     size = jnp.hypot(growth.d1, growth.d2)
     size = jnp.where((size > 0) & jnp.isfinite(size), size, 1.0)
     log = growth.log + jnp.log(size)
@@ -230,7 +230,7 @@ def _counted(growth: Growth, t: Array, t1: Array) -> Growth:
 def _saltation(
     osc: OwnOscillator, before: Mode, after: Mode, number: Array, y, tangents: Tangents
 ) -> Tangents:
-    """Tangents behind an event, of scalars: the guard of that number fired at the state y."""
+    """Tangents of one lane behind an event: guard `number` fired at the state y = (x1, x2, t)."""
     entry, exit_ = field_at(osc, before, y), field_at(osc, after, y)
 
     def behind(d):
@@ -243,7 +243,7 @@ def _saltation(
 
 
 def delay_of_event(osc: OwnOscillator, before: Mode, number: Array, y, d) -> Array:
-    """How much later, for a tangent d, the guard of that number fires; 0 where it is touched."""
+    """How much later guard `number` fires for the tangent d; 0 where it is only touched."""
 
     def guard(*y):
         guards = guards_at(osc, before, y)
@@ -255,12 +255,12 @@ def delay_of_event(osc: OwnOscillator, before: Mode, number: Array, y, d) -> Arr
 
 
 def course_of_step(osc: OwnOscillator, lanes: Lanes, new: Lanes, ones: Array) -> Course:
-    """The way of lanes in a step."""
+    """The `Course` of the lanes in a step."""
     ends = [(one.x1, one.x2, _x2_slope(osc, lanes.mode, one)) for one in (lanes, new)]
     return Course.of_step(ends[0], ends[1], materialise(new.t - lanes.t, ones))
 
 
 def _x2_slope(osc: OwnOscillator, mode: Mode, lanes: Lanes) -> Array:
-    """x2' of the lanes in a mode; their `a`, where the mass sticks, is what belts have to hold."""
+    """x2' in a mode. Where the mass sticks it is the belt's; `a` is then what friction holds."""
     rate = rate_of_stick(at_time(osc, lanes.t), mode)
     return jnp.where(mode.any_stuck, rate, lanes.a)

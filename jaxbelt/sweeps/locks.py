@@ -12,14 +12,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-#: More blocks than there are: end of the range that locks the whole store.
+#: End of the range of blocks that locks the whole store: more than any store has.
 ALL_BLOCKS = 2**63
-#: Seconds that the door may stay closed: a store may be created behind it.
+#: Seconds to wait for the door: its holder may be creating a store.
 DOOR_PATIENCE = 60.0
 
 
 def hidden_beside(path: Path, kind: str) -> Path:
-    """The hidden folder of a kind beside a store, which may be the working folder."""
+    """Path of a hidden folder of some kind beside a store, which may be the working folder."""
     path = Path(os.path.abspath(path))
     return path.with_name(f".{path.name}.{kind}")
 
@@ -33,7 +33,7 @@ def locked(
 ) -> Iterator[None]:
     """Keeps other sweeps off these blocks, on this machine and on others that see the folder.
 
-    prepare is called behind the door, when the blocks are locked.
+    prepare is called while the door is held and the blocks are locked.
     """
     from filelock import FileLock
 
@@ -60,7 +60,7 @@ def locked(
 
 
 def _refuse_if_held(path: Path, other: Path) -> None:
-    """Raises if another process holds that lock; removes locks of processes that died."""
+    """Raises a `BlockingIOError` if another process holds the lock `other`; else removes it."""
     from filelock import FileLock, Timeout
 
     lock = FileLock(other, timeout=0)

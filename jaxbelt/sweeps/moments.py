@@ -1,4 +1,4 @@
-"""Moments at which a reducer is asked: events, extrema, crossings of a section, fixed times.
+"""Moments at which a reducer is updated: events, extrema, crossings of a section, fixed times.
 
 A reducer lists them in its attribute `at`, a tuple. A section is a function of the state, and its
 moments are where the value passes 0; extrema are sections, too: x1 is extreme where x2 = 0, and x2
@@ -34,8 +34,8 @@ class AtEvents:
 class AtExtrema:
     """Every extremum of a coordinate.
 
-    A jump of x2 from rising to falling at an event is an extremum; one that lasts for a stick phase
-    is reported at its end.
+    An event at which x2 turns from rising to falling, or back, is an extremum of x2; an extremum
+    that lasts for a stick phase is reported at the end of the phase.
 
     Attributes:
         of: "x1" or "x2".
@@ -88,11 +88,11 @@ class AtTimes:
         object.__setattr__(self, "times", tuple(times.tolist()))
 
     def next_time(self, osc: Oscillator, passed: Array) -> Array:
-        """The next of the times when so many are past; inf when all are."""
+        """The next time when `passed` of the times are past; inf when all are past."""
         return jnp.asarray((*self.times, np.inf))[jnp.minimum(passed, len(self.times))]
 
     def passed_at(self, osc: Oscillator, t: Array, count: Array) -> Array:
-        """How many are past at the start of runs, as numbers like `count`."""
+        """Number of times before the start t of runs, of the type of `count`; 0 without a clock."""
         if not has_clock(osc):
             return jnp.zeros_like(count)
         early = [jnp.where(time < t, 1, 0) for time in self.times]
@@ -122,12 +122,12 @@ class AtPhase:
         object.__setattr__(self, "phase", phase)
 
     def next_time(self, osc: Oscillator, passed: Array) -> Array:
-        """The time of the moment that so many are before, counted from the turn of t = 0 on."""
+        """The time of moment number `passed`; at moment 0 Omega t is the phase itself."""
         frequency = clock_frequency(osc)
         return (self.phase + 2 * np.pi * passed.astype(frequency.dtype)) / frequency
 
     def passed_at(self, osc: Oscillator, t: Array, count: Array) -> Array:
-        """The number of the first moment at t or later, as numbers like `count`."""
+        """Number of the first moment at t or later, of the type of `count`."""
         turns = (clock_frequency(osc) * t - self.phase) / (2 * np.pi)
         return jnp.ceil(turns - 1e-12 * (1 + jnp.abs(turns))).astype(count.dtype)
 
@@ -136,7 +136,7 @@ MOMENTS = (AtEvents, AtExtrema, AtSection, AtTimes, AtPhase)
 
 
 def checked(at: Any) -> tuple[Any, ...]:
-    """Checks the moments of a reducer."""
+    """Returns the moments of a reducer, or raises a `ValueError`."""
     fits = isinstance(at, tuple) and at and all(isinstance(one, MOMENTS) for one in at)
     names = ", ".join(kind.__name__ for kind in MOMENTS)
     require_value(fits, "observe.at", f"a tuple of {names}", at)
@@ -144,7 +144,7 @@ def checked(at: Any) -> tuple[Any, ...]:
 
 
 def check_moments(at: tuple[Any, ...], osc: Oscillator) -> None:
-    """Raise a `ValueError` where moments are not for the oscillator."""
+    """Raises a `ValueError` where a moment is not possible for the oscillator."""
     clock = has_clock(osc)
     steady = not any(isinstance(belt.velocity, Oscillating) for belt in osc.belts)
     for moment in at:
@@ -189,27 +189,27 @@ def value_and_rate(
 def side_of(value: Array, rate: Array, before: Array) -> Array:
     """Side of a section, 1 or -1.
 
-    On the section it is the side that the motion goes to; at rest on it, the one before.
+    Where the value is 0 it is the side that the motion goes to; where the rate is 0, too, `before`.
     """
     return jnp.where(value != 0, jnp.sign(value), jnp.where(rate != 0, jnp.sign(rate), before))
 
 
 # --- where a section is crossed -------------------------------------------------------------------
 
-#: Equal parts of a step, and of a stick phase, in which crossings of a section are searched. In a
-#: part with at most one extremum of the value all crossings are found.
+#: Number of equal parts of a step, and of a stick phase, in which crossings of a section are
+#: searched. In a part with at most one extremum of the value all crossings are found.
 PARTS_OF_STEP, PARTS_OF_HOLD = 4, 8
 #: Smallest part of a step that a cut may leave at one of its ends.
 LEAST_CUT = 1e-3
 
 
 class Course(NamedTuple):
-    """The state along a way from 0 to 1, arrays [lanes].
+    """The state along a step or a stick phase, for theta from 0 to 1, arrays [lanes].
 
     Attributes:
-        x1: Coefficients of a polynomial.
-        x2: The constant velocity of a stick phase; None for a step.
-        duration: Duration of the way.
+        x1: Coefficients of a polynomial in theta.
+        x2: The constant velocity of a stick phase; None for a step: x2 follows from x1.
+        duration: Duration of the step or phase.
     """
 
     x1: tuple[Array, ...]
@@ -218,7 +218,7 @@ class Course(NamedTuple):
 
     @classmethod
     def of_step(cls, starts, ends, h: Array) -> "Course":
-        """The quintic that has x1, x2 and x2' of both ends; starts, ends: these."""
+        """The quintic through starts and ends, (x1, x2, x2') each, of a step of size h."""
         start, end = ((x1, h * x2, h * h * a) for x1, x2, a in (starts, ends))
         return cls(quintic(start, end), None, h)
 
@@ -241,12 +241,12 @@ class Course(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """A section at the ends of the parts of a way, lists of arrays [lanes].
+    """Samples of a section at the ends of equal parts of a course, lists of arrays [lanes].
 
     Attributes:
-        values: One more than there are parts.
+        values: Values of the section, one more than there are parts.
         slopes: Derivatives by theta, likewise.
-        sides: Sides, likewise, beginning with the one before.
+        sides: Sides, likewise; the first one is that before the course.
         crosses: Whether the side changes in a part.
         dips: Whether the value comes nearer to 0 in a part and goes away again, so that it may pass
             0 twice.
@@ -276,8 +276,8 @@ class Parts(NamedTuple):
 class Cut(NamedTuple):
     """Where a step should be cut for a section.
 
-    theta: from 0 to 1; at 1 no cut is needed. at_start: whether the cut step crosses the section
-    near its start, not near its end.
+    theta: fraction of the step to keep; 1: no cut is needed. at_start: whether the cut step crosses
+    the section near its start, not near its end.
     """
 
     theta: Array
@@ -288,13 +288,13 @@ def cut_of_step(side: Array, samples: Sequence[tuple[Array, Array]], h: Array, r
     """Where a step of size h should be cut, so that it crosses a section at most once, near an end.
 
     Within a part the value is approximated by the cubic through its values and slopes: the step is
-    repeated, and its end is then nearer, until it is near enough.
+    repeated and ends nearer to the crossing each time, until it is near enough.
 
     Args:
         side: Side of the section before the step.
-        samples: Value and derivative by theta at the ends of the parts, inside by the interpolant.
+        samples: Value and derivative by theta at the ends of the parts, from the interpolant.
         h: Size of the step.
-        reach: An end that is nearer to a crossing than this time finds it by a Taylor step.
+        reach: Time from an end of the step within which a Taylor step finds a crossing.
     """
     side, samples, h, reach = lax.stop_gradient((side, samples, h, reach))
     parts = Parts.of(samples, side)
@@ -325,9 +325,9 @@ def cut_of_step(side: Array, samples: Sequence[tuple[Array, Array]], h: Array, r
     at_start = parts.crosses[0] & (side * r0 < 0) & (jnp.abs(g0) <= near * jnp.abs(r0))
     at_end = parts.crosses[-1] & (parts.sides[-1] * r1 > 0) & (jnp.abs(g1) <= near * jnp.abs(r1))
     stays = (count == 0) | ((count == 1) & (at_start | at_end))
-    # A crossing near the start is found after a step of one part.
+    # For a crossing near the start the step is cut to its first part.
     theta = jnp.where(crosses, jnp.where(at_start, 1 / n, root), extremum)
-    # Where a section is only touched, no end is ever near; the step is then as short as `reach`.
+    # Where a section is only touched, no end is ever near; cuts stop at steps of 0.1 `reach`.
     theta = jnp.where(stays | (h <= 0.1 * reach), 1.0, theta)
     nearer = jnp.abs(g0 * r1) < jnp.abs(g1 * r0)
     return Cut(theta, at_start | (~at_end & nearer))
@@ -338,8 +338,8 @@ def crossings_held(
 ) -> tuple[Array, Array, Array]:
     """Crossings of a section in stick phases: at most two in each of `PARTS_OF_HOLD` parts.
 
-    x1 moves evenly, so all are found if the value has at most one extremum in a part; others may be
-    missed in pairs.
+    x1 is linear in theta, so all are found if the value has at most one extremum in a part; else
+    pairs of crossings may be missed.
 
     Args:
         sample: sample(theta) is the value and its derivative by theta, for theta from 0 to 1.
@@ -348,8 +348,8 @@ def crossings_held(
         holds: Lanes that stick.
 
     Returns:
-        The side at the end, and theta of the crossings, twice [parts, lanes], inf where there is
-        none.
+        The side at the end, [lanes], and theta of the first and of the second crossing in each
+        part, both [parts, lanes], inf where there is none.
     """
     n = PARTS_OF_HOLD
     samples = [sample(jnp.full_like(side, k / n)) for k in range(n + 1)]
@@ -391,14 +391,14 @@ def crossings_held(
 
 
 def _cubic(parts: Parts, k: int, length: float) -> tuple[Array, ...]:
-    """Cubic through the values and slopes at both ends of a part."""
+    """Coefficients of the cubic through the values and slopes at both ends of a part."""
     g0, g1 = parts.values[k], parts.values[k + 1]
     d0, d1 = length * parts.slopes[k], length * parts.slopes[k + 1]
     return g0, d0, 3 * (g1 - g0) - 2 * d0 - d1, d0 + d1 - 2 * (g1 - g0)
 
 
 def _extremum_of(cubic: Sequence[Array]) -> Array:
-    """Where a cubic is extreme whose slope changes its sign between 0 and 1; else 1."""
+    """Extremum in [0, 1] of a cubic whose slope changes its sign there; else 1."""
     _, d0, c2, c3 = cubic
     d1 = d0 + 2 * c2 + 3 * c3
     divisor = jnp.sign(d0) * jnp.sqrt(jnp.maximum(c2 * c2 - 3 * c3 * d0, 0.0)) - c2
@@ -407,7 +407,7 @@ def _extremum_of(cubic: Sequence[Array]) -> Array:
 
 
 def _bisected(function: Callable[[Array], Array], side: Array) -> Array:
-    """Where in (0, 1) the function is no longer on that side."""
+    """Place in (0, 1), by bisection, where the function leaves the given side."""
 
     def halve(_, ends):
         low, high = ends

@@ -12,7 +12,7 @@ from ..cycles.attractors import is_same
 from ..cycles.cycle import Cycle
 from ..cycles.periodic import PeriodicMotion, is_same_motion
 
-#: Where the mass rests, at the end of the words for an attractor, or before its number.
+#: Matches the place of rest in the words for an attractor: at their end or before a number (n).
 REST = re.compile(r"(?<=rest.at.)-?\d+(\.\d+)?(e[+-]\d+)?(?=(.\(\d+\))?$)")
 
 
@@ -25,7 +25,7 @@ class Found(NamedTuple):
     cycle: Cycle | PeriodicMotion | None
 
     def is_of(self, cycle: Cycle | PeriodicMotion) -> bool:
-        """Whether it is that cycle."""
+        """Whether the attractor is the given cycle or motion."""
         if isinstance(cycle, PeriodicMotion):
             return isinstance(self.cycle, PeriodicMotion) and is_same_motion(self.cycle, cycle)
         return isinstance(self.cycle, Cycle) and is_same(self.cycle, cycle)
@@ -34,9 +34,9 @@ class Found(NamedTuple):
 def told_apart(kinds: np.ndarray, of_run: Callable[[tuple[int, ...]], Found]) -> list[Found]:
     """The attractors that runs lead to, each with its runs, the most frequent first.
 
-    kinds: of the runs; of_run: the attractor of a run, by its index, with the runs that are like
-    it, of whatever kind. Runs that differ more than the accuracy of a sweep may still be on one
-    cycle.
+    kinds: kind of each run; of_run(index): the attractor of a run, with a mask of similar runs of
+    any kind. Runs that differ by more than the accuracy of a sweep may still be on one cycle;
+    `is_of` decides.
     """
     found: list[Found] = []
     left = kinds != "undecided"
@@ -55,7 +55,7 @@ def told_apart(kinds: np.ndarray, of_run: Callable[[tuple[int, ...]], Found]) ->
 
 
 def _with_numbers(found: list[Found]) -> list[Found]:
-    """Attractors with a number behind the name where several have the same one."""
+    """The attractors, with a number behind the name where several have the same name."""
     times = Counter(one.name for one in found)
     seen: Counter[str] = Counter()
     for i, one in enumerate(found):
@@ -81,7 +81,7 @@ def words_for(kind: str, sticks: np.ndarray, x1: float, length: float) -> str:
 
 
 def rest_in_m(words: str, length: Any) -> str:
-    """The words with the place of rest in m, to the digits that are known; length: of 1, in m."""
+    """The words with the place of rest in m, to as many digits; length: the length 1, in m."""
 
     def in_m(found: re.Match) -> str:
         digits = len(found[0].partition("e")[0].replace(".", "").lstrip("-0"))

@@ -1,4 +1,4 @@
-"""Observers of whole runs: the state at t1, and what a user's reducer makes of the events."""
+"""Observers of whole runs: the state at t1, and the results of a user's reducer of events."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -81,7 +81,7 @@ def as_given(
         length = osc.units.length
         return function(in_units_of_user(osc), length * x1, length * x2, *more)
 
-    # Some of the oscillator's leaves differ from lane to lane.
+    # Leaves that differ from lane to lane are arrays [lanes]; the others are scalars.
     axes = jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, osc)
     in_axes = (axes, 0, 0, *(0 for _ in more))
     return jax.vmap(of_lane, in_axes=in_axes)(osc, x1, x2, *more)
@@ -97,7 +97,7 @@ class RunEvent(eqx.Module):
         kind: An `EventKind`; 0 at moments that are no events.
         belt: Number of the belt; -1 at moments that are no events.
         moment: For a reducer with `at` or `rates`: number of the moment in `at`.
-        integrals: Likewise: integrals of the rates from 0 to t.
+        integrals: Likewise: integrals of the rates from the start of the run to t.
     """
 
     t: Array
@@ -117,7 +117,7 @@ class RunEnd(eqx.Module):
         x1: Displacement.
         x2: Velocity.
         status: A `Status` code.
-        integrals: For a reducer with `at` or `rates`: integrals of the rates from 0 to t.
+        integrals: For a reducer with `at` or `rates`: integrals of the rates over the run.
     """
 
     t: Array

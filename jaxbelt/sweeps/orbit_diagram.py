@@ -4,10 +4,10 @@ At each of many values of the parameter orbits from a few starts are followed to
 and its points at some moment (extrema, crossings of a section, events) are kept. Two sweeps do it:
 one as with `observe="attractor"`, so that each run takes the transient that it needs, and one that
 follows each cycle through one loop, from its largest displacement. The values of the parameter are
-data of both: other values compile nothing, and so a picture can be zoomed into.
+data of both: other values compile nothing, so a picture can be zoomed into.
 
-Where each value begins from what the one before has led to, as in an experiment, the first sweep is
-one value after the other, in a kernel of few lanes.
+Where each value begins from the attractor of the value before, as in an experiment, the first sweep
+does one value after the other, in a kernel of few lanes.
 """
 
 import functools
@@ -67,18 +67,18 @@ MOST_RUNS = 64
 #: A run through a loop goes on beyond it by this fraction of the period.
 OUTSIDE = 1e-4
 
-#: Of a forced oscillator: periods that are left out at first, fewer of them where a run begins on
-#: the attractor of a neighbouring value, and points that are kept.
+#: Forced oscillators: number of periods left out as transient, fewer where a run begins on the
+#: attractor of a neighbouring value, and number of points that are kept.
 PERIODS_LEFT_OUT, PERIODS_LEFT_OUT_BESIDE, STROBES = 1000, 500, 64
-#: Lanes of a run that begins where another one has ended.
+#: Lanes of the kernel where each value begins from the attractor of the value before.
 LANES_OF_FEW = 4
-#: Such a run begins so far from an equilibrium or a periodic forced motion, in own units: these may
-#: have become unstable, and a run that begins on one would stay. It begins where a mass is stuck
-#: for ever: else the mass would creep with the parameter.
+#: Distance, in own units, at which such a run begins from an equilibrium or a periodic forced
+#: motion: these may have become unstable, and a run that begins on one would stay. A mass stuck for
+#: ever begins where it is: else it would creep as the parameter changes.
 OFF_ATTRACTOR = 1e-3
-#: In which sense the parameter changes where runs begin so.
+#: For each value of `sense`, the sense in which the parameter changes for each start.
 SENSES = {"up": ("up",), "down": ("down",), "both": ("up", "down")}
-#: The kind of such points without a period: of chaos, of a torus, or of a slow approach.
+#: Kind of a forced run whose points do not repeat: chaos, a torus, or a slow approach.
 NOT_PERIODIC = "no period found"
 
 
@@ -95,7 +95,7 @@ class OrbitDiagram(eqx.Module):
             fewer: of a cycle one for each of its moments, in their order; of a mass at rest its
             place.
         x2: Velocities at these points, likewise.
-        at: The moments.
+        at: The moments at which points are kept.
         name: Name of the parameter: its path, or the name of the function's argument.
         sampling: Arguments that `over` uses again.
         is_argument: Whether `name` is that of a function's argument.
@@ -224,7 +224,7 @@ def orbit_diagram(
     if sense is not None:
         require_one_of(sense, tuple(SENSES), "sense")
         require_value(len(starts) == 1, "y0", "one start where sense is given", y0)
-    # A force of a frequency that is known to be 0 is a constant one, without a clock.
+    # A force whose frequency is a known 0 is a constant force, without a clock.
     ends = [variation.oscillator(np.array([value])) for value in (first, last)]
     example = max(ends, key=has_clock)
     if has_clock(example):
@@ -256,7 +256,7 @@ class Sampling:
     """Arguments that determine the points of an orbit diagram, except its span; see
     `orbit_diagram`.
 
-    senses: in which sense the parameter changes, for each start; none: each value has the starts.
+    senses: sense in which the parameter changes, for each start; (): all values use the starts.
     """
 
     variation: Variation
@@ -318,13 +318,13 @@ class Sampling:
         reducer = _KeptMoments((self.at,), STROBES, ("x1", "x2"), left_out)
         off = OFF_ATTRACTOR * grid.length()
         share = self.at.phase / (2 * np.pi)
-        # Where all waves together have a period, runs go on at the time in it that others came to.
+        # With a common period of all waves, runs begin at its phase where the last ones ended.
         cycle = np.maximum(turns, 1)
         passed = np.full(period.size, np.ceil(-share - 1e-12))
 
         def ends(which):
-            """Half a period behind the last moment: at a moment rounding decides whether it
-            counts."""
+            """Ends of runs, half a period behind the last moment: an end at a moment would let
+            rounding decide whether it counts."""
             return (share + passed[which] + left_out + STROBES - 0.5) * period[which]
 
         def further(found, which, following):
@@ -363,7 +363,7 @@ class Sampling:
         fine = np.all((frequency > 0) & np.isfinite(frequency))
         require(fine, "span", WITH_A_CLOCK, (float(values[0]), float(values[-1])))
         pairs = zip(map(row, repeating(made)), map(row, map(has_amplitude, waves_of(made))))
-        # What has no amplitude repeats always; but strobes are at the periods of the clock.
+        # Waves without amplitude always repeat; but the clock's own period sets the strobes.
         rates = [np.where((size > 0) | (rate == frequency), rate, 0.0) for rate, size in pairs]
         with np.errstate(all="ignore"):
             return 2 * np.pi / frequency, common_turns(rates, np)
@@ -381,11 +381,11 @@ class Sampling:
         **numbers: Any,
     ) -> dict[str, np.ndarray]:
         """Results of an observer for runs from states, [2 or 3, runs], that go on until `ends` at
-        least; which: their numbers; numbers: more of `threads.run`."""
+        least; which: numbers of the runs; numbers: more arguments of `threads.run`."""
         numbers |= self.numbers
         begin = states[2] if len(states) == 3 else np.zeros(len(ends))
         found, left = {}, np.arange(len(ends))
-        # Runs that end together take twice as long as they need to, at most.
+        # Runs with one t1 are chosen so that none takes more than twice as long as it needs.
         while left.size:
             t1 = float(np.max(ends[left]))
             alike = t1 - begin[left] <= 2 * (ends - begin)[left]
@@ -403,10 +403,10 @@ class Sampling:
         ends: Callable[[np.ndarray], np.ndarray],
         **numbers: Any,
     ) -> dict[str, np.ndarray]:
-        """Results of an observer for all runs; ends: when runs end, by their numbers. Where the
-        parameter changes in some sense, `further` says of results, and of the numbers of these runs
-        and the following ones, where the latter begin, [2 or 3, runs], see `Grid.results`; NaN:
-        where the former did."""
+        """Results of an observer for all runs; ends(numbers): when runs end. With `senses`,
+        further(results, their numbers, numbers of the next runs) returns the states from which the
+        next runs begin, [2 or 3, runs], see `Grid.results`; NaN: they begin where the present runs
+        began."""
         if not self.senses:
             states = np.tile(self.starts.T, self.rows)
             which = np.arange(states.shape[1])
@@ -418,7 +418,7 @@ class Sampling:
         ]
         runs = [row * len(lanes) + lanes for row in rows]
         states = self.starts.T
-        if isinstance(self.at, AtPhase):  # with the time at which they begin
+        if isinstance(self.at, AtPhase):  # with the start time
             states = np.concatenate([states, np.zeros((1, len(lanes)))])
         for i, which in enumerate(runs):
             note_progress(f"{i} of {self.rows} values")
@@ -437,7 +437,7 @@ class Sampling:
         """
         period, top = period[:, None], x1_max[:, None]
         (t, x1, x2, number), cut = self._moments(grid, which, x1_max, (1 + OUTSIDE) * period[:, 0])
-        # One loop: moments that near to its beginning are met again at its end.
+        # Exactly one loop: moments within OUTSIDE of its beginning are met again at its end.
         inside = (t > OUTSIDE * period) & (t <= (1 + OUTSIDE) * period)
         size = RUN * self.numbers["rtol"] * (top - x1_min[:, None])
         back = inside & (number == EXTREMUM) & (np.abs(x1 - top) < size)
@@ -453,10 +453,10 @@ class Sampling:
         return status, *(np.where(held, x, np.nan) for x in points)
 
     def _moments(self, grid: Grid, which: np.ndarray, x1_max: np.ndarray, end: np.ndarray):
-        """The moments of loops until a time each, in order.
+        """The moments of loops from x1_max until the times `end`, [cycles], in order.
 
-        Returns t, x1, x2 and the number, [4, cycles, moments], NaN where there is none; and which
-        loops are cut off, [cycles].
+        Returns t, x1, x2 and the moment's number, [4, cycles, moments], NaN where there is none,
+        and a mask of loops that are cut off, [cycles].
         """
         at = (AtExtrema("x1"),) if self.at == AtExtrema("x1") else (AtExtrema("x1"), self.at)
         reducer = _KeptMoments(at, MOMENTS_KEPT)
@@ -489,7 +489,7 @@ class Sampling:
 
 
 def _beside_attractor(grid: Grid) -> Callable[..., np.ndarray]:
-    """Gives a state on the attractor of each run, [2, runs], or beside it, by its results."""
+    """Returns a function: from results, a state on or beside each run's attractor, [2, runs]."""
     off = OFF_ATTRACTOR * grid.length()
 
     def state(found: dict[str, np.ndarray], which: np.ndarray, following: np.ndarray):
@@ -505,22 +505,22 @@ def _beside_attractor(grid: Grid) -> Callable[..., np.ndarray]:
 def _fill_in(
     found: dict[str, np.ndarray], which: np.ndarray, results: dict[str, np.ndarray], size: int
 ) -> None:
-    """Puts results of runs, by their numbers, into columns of so many."""
+    """Writes results of the runs `which` into the columns `found`, of `size` runs each."""
     for name, values in results.items():
         missing = np.full((size, *values.shape[1:]), np.nan)
         found.setdefault(name, missing)[which] = values
 
 
 def _have_come_to_rest(found: dict[str, np.ndarray]) -> np.ndarray:
-    """Which forced runs have come to rest, by their results."""
+    """Mask of forced runs that have come to rest, from their results."""
     return np.isin(found["status"], list(RESTS))
 
 
 def _turns_in(x1: np.ndarray, x2: np.ndarray, common: np.ndarray) -> np.ndarray:
-    """After how many points rows of them repeat, all of them, half as many at most; 0: not.
+    """Number of points, up to half of all, after which each row of points repeats; 0: none.
 
-    common: points after which what pushes repeats, 0: never; a motion repeats after as many, or a
-    multiple: what seems to repeat before does not, where waves beat slowly.
+    common: number of points after which the forcing repeats, 0: never. A motion repeats only after
+    a multiple of it; where waves beat slowly, points may only seem to repeat before.
     """
     turns = np.zeros(len(x1), dtype=int)
     sizes = [SAME * (np.ptp(x, axis=1) + np.max(np.abs(x), axis=1)) for x in (x1, x2)]
@@ -541,15 +541,15 @@ RESTS = {Status.STUCK_FOREVER: STUCK_FOR_EVER, Status.PSEUDO_FOCUS: EQUILIBRIUM}
 ENDS_AT = ("x1 at the end", "x2 at the end")
 
 
-#: Moments are kept in pieces of so many: larger arrays in all lanes make a slow kernel.
+#: Moments are kept in arrays of this many: larger arrays in all lanes make a slow kernel.
 PIECE_KEPT = 8
 
 
 @dataclass(frozen=True)
 class _KeptMoments:
-    """The first `room` moments of a run behind some that are skipped: of t, x1, x2 and the moment's
-    number in `at` those in `kept`, and the state at the end. A reducer, see `sweep.sweep`; room: a
-    multiple of PIECE_KEPT."""
+    """A reducer, see `sweep.sweep`, that keeps `room` moments of a run behind `skipped` ones, and
+    the state at the end of the run. kept: the fields that are kept of a moment (moment: its number
+    in `at`); room: a multiple of PIECE_KEPT."""
 
     at: tuple[Any, ...]
     room: int
@@ -584,14 +584,14 @@ class _KeptMoments:
         return pieces | dict(zip(ENDS_AT, (end.x1, end.x2), strict=True))
 
     def last_state(self, found: dict[str, np.ndarray]) -> tuple[np.ndarray, ...]:
-        """The last (x1, x2) that was kept of runs, [runs], NaN where there is none, and which of
-        those kept it was."""
+        """x1 and x2 of the last moment kept of each run, [runs], NaN where none was kept, and its
+        index among the moments kept."""
         x1, x2 = self.columns(found)
         last = self.room - 1 - np.argmax(np.isfinite(x1)[:, ::-1], axis=1)
         return *(np.take_along_axis(x, last[:, None], 1)[:, 0] for x in (x1, x2)), last
 
     def columns(self, found: dict[str, np.ndarray]) -> list[np.ndarray]:
-        """What was kept of runs, [runs, room] each, from their results."""
+        """An array [runs, room] for each name in `kept`, from the results of runs."""
         return [
             np.concatenate([found[f"{name} {i}"] for i in self.pieces], axis=-1)
             for name in self.kept

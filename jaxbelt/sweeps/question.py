@@ -44,22 +44,22 @@ if TYPE_CHECKING:
 
 #: Default t1 of attractor runs: some 500 loops; nearly all runs are decided long before.
 LONG_ENOUGH = 30_000.0
-#: Observers that have a name.
+#: Names of observers for `observe`, without a clock.
 NAMED: dict[str, type[Observer]] = {"final": Final, "attractor": Attractor}
-#: And those where the oscillators know the time.
+#: The same for forced oscillators.
 NAMED_FORCED: dict[str, type[Observer]] = {
     "final": Final,
     "attractor": ForcedAttractor,
     "lyapunov": LargestExponent,
 }
-#: Largest numbers of points of the grid at which `make` counts to eleven digits, and to seven; the
-#: same on every machine.
+#: Largest numbers of points of the grid at which the oscillators count in the identity of a sweep,
+#: to eleven digits and to seven; the same on every machine.
 SAMPLE, MOST_COUNTED = 2**14, 2**24
 
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """Arguments of a sweep; numbers: t1, rtol and atol."""
+    """Checked arguments of a sweep; numbers: t1, rtol, atol and, with a clock, t0."""
 
     grid: Grid
     observe: Any
@@ -192,7 +192,7 @@ class Question:
         """Hash of the starts and parameters of the runs, by numbers that do not depend on the
         machine: eleven digits of `SAMPLE` runs, and single precision of `MOST_COUNTED`.
 
-        More digits of so many runs would depend on it: a few lie where two machines round apart.
+        With more digits a few of so many numbers would be rounded differently by two machines.
         """
         grid = self.grid
         sample = np.unique(np.linspace(0, grid.runs - 1, SAMPLE).astype(int))
@@ -211,7 +211,7 @@ class Question:
 def quantities_of(dataset: "xarray.Dataset") -> dict[str, str]:
     """Dimensions of the variables and coordinates of a dataset: their attributes `quantity`.
 
-    In stores of earlier versions none has it; there the observers describe the variables.
+    Stores of earlier versions lack it; there the descriptions of the observers are used.
     """
     named = dataset.variables.items()
     stated = {str(name): one.attrs["quantity"] for name, one in named if "quantity" in one.attrs}
@@ -271,7 +271,7 @@ def _versions() -> str:
 
 
 def _expression(make: Callable) -> str | None:
-    """The function as any program can write it: its full name, or the call that made it."""
+    """Expression for a function in any program: its full name or a `partial` of it; else None."""
     if isinstance(make, functools.partial):
         function = _expression(make.func)
         given = [*map(_value, make.args), *(f"{k}={_value(v)}" for k, v in make.keywords.items())]
@@ -281,7 +281,7 @@ def _expression(make: Callable) -> str | None:
 
 
 def _text_of(make: Callable) -> str:
-    """Source of a function, with all that stands in its lines, or else its name."""
+    """Source of a function, all of its lines, or its name where there is no source."""
     try:
         return inspect.getsource(make).strip()
     except (OSError, TypeError):
@@ -289,13 +289,13 @@ def _text_of(make: Callable) -> str:
 
 
 def _value(value: Any) -> str:
-    """An argument that was fixed; an array of one number as that number."""
+    """The repr of an argument that `partial` fixed; of a scalar array the repr of its number."""
     return repr(float(value)) if np.ndim(value) == 0 and hasattr(value, "dtype") else repr(value)
 
 
 def _kinds_of(module: eqx.Module, name: str) -> str:
-    """Classes of a law or force and of what it is made of; with its static arguments where all of
-    them are this package's, else with its fingerprint; name: for messages."""
+    """Classes of a law or force and of the modules in it; with a hash of its static arguments
+    where all classes are this package's, else with its fingerprint; name: for messages."""
     parts = [*_modules_in(module)]
     kinds = [type(part) for part in parts]
     names = " with ".join(kind.__qualname__ for kind in kinds)
@@ -311,7 +311,7 @@ def _kinds_of(module: eqx.Module, name: str) -> str:
 
 
 def _modules_in(module: eqx.Module) -> Iterator[eqx.Module]:
-    """A module and those in it."""
+    """Yields a module and all modules inside it."""
     yield module
     parts = jax.tree.leaves(
         list(vars(module).values()), is_leaf=lambda part: isinstance(part, eqx.Module)

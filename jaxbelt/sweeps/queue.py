@@ -3,12 +3,12 @@
 A pass of the loop is
 
 - *refill*: lanes whose run has ended hand in their result and take the next run from the queue;
-- *events*: lanes that stand on a guard of their mode go on by the rules of `modes`, and stick
+- *events*: lanes that stand on a guard change their mode by the rules of `modes`, and stick
   phases are passed in closed form;
 - *steps*: a few Runge-Kutta steps of the lanes that slip.
 
-Derivatives in some directions go through the same loops beside the values: each refill, look at
-the events and step is made once, with all of them, see `derivatives.in_directions`.
+Derivatives in some directions go through the same loops beside the values: each refill, check for
+events and step is made once, for values and derivatives, see `derivatives.in_directions`.
 """
 
 import functools
@@ -35,11 +35,11 @@ from ..numerics.derivatives import in_directions
 from ..numerics.widths import SideBySide
 from ..results import Status
 
-#: Looks at the events between two refills: a refill costs about as much as a step, and a lane that
+#: Checks for events between two refills: a refill costs about as much as a step, and a lane that
 #: waits for one is idle.
 ROUNDS_PER_PASS = 4
-#: Passes between two looks at whether there is more to do. An accelerator waits for the host at
-#: each look, and else at none: passes that find nothing to do change nothing.
+#: Passes between two checks of whether there is more to do. An accelerator waits for the host at
+#: these checks only; passes that find nothing to do change nothing.
 PASSES_PER_LOOK = SideBySide(on_cpu=1, elsewhere=4)
 
 #: The default absolute tolerance of a step, in own units.
@@ -61,7 +61,7 @@ def _oscillators(program: Program, shared, rows: tuple[Array, ...]) -> OwnOscill
 
 
 def _moves_of(osc: OwnOscillator, observer: Observer) -> tuple[Callable, Callable, Callable]:
-    """How lanes go on: `pass_events`, `window_of` and `take_step`, with a clock or without."""
+    """`pass_events`, `window_of` and `take_step` for lanes with a clock, or without one."""
     if has_clock(osc):
         jumps = not observer.steps_while_stuck
         pass_events = functools.partial(timed_events.pass_timed_events, jumps=jumps)
@@ -102,12 +102,12 @@ def idle(program: Program, shared, width: int, columns: int) -> Stream:
     lanes = _begin(program, osc, run, *start)
     lanes = eqx.tree_at(lambda n: n.done, lanes, jnp.ones(width, dtype=bool))
     stream = Stream(lanes, rows, jnp.zeros((), jnp.int32), jnp.ones(width))
-    # Of types such as the kernel gives back: weak ones of a reducer would have it compiled twice.
+    # Strong types, as the kernel returns: weak types of a reducer would compile it twice.
     return jax.tree.map(lambda leaf: lax.convert_element_type(leaf, leaf.dtype), stream)
 
 
 def differentiable(stream: Stream) -> Stream:
-    """The numbers of a stream that may have derivatives; None in place of all others."""
+    """The leaves of a stream that may have derivatives; None in place of all others."""
     floats = eqx.filter(stream, eqx.is_inexact_array)
     pairs = (_floats_of_lanes(stream.lanes), None)
     return eqx.tree_at(lambda s: (s.lanes, s.ones), floats, pairs)
@@ -130,7 +130,7 @@ def _ordered(values: dict[str, Any]) -> list[str]:
 
 
 def _handed_in(observer: Observer, osc: OwnOscillator, lanes: Lanes) -> dict[str, Any]:
-    """What is known of the lanes, in the units in which their runs were given."""
+    """The observer's results for the lanes, in the units in which their runs were given."""
     found = observer.finish(osc, lanes)
     for name, value in found.items():
         known = observer.variables.get(name)
@@ -140,7 +140,7 @@ def _handed_in(observer: Observer, osc: OwnOscillator, lanes: Lanes) -> dict[str
 
 
 def _columns(values: dict[str, Any]) -> list[Array]:
-    """Results as columns [lanes] of floats: what is a tuple has a column each."""
+    """Results by sorted names as float columns [lanes], one for each entry of a tuple or vector."""
     columns = []
     for name in _ordered(values):
         for value in jax.tree.leaves(values[name]):
@@ -154,7 +154,7 @@ class Common(eqx.Module):
 
     shared: the leaves of the oscillator that do not differ from run to run; t1; rtol; atol: in the
     units in which runs are given, NaN for the default; limit: how many passes a run may take. t0:
-    where all begin, of those that know the time, unless each has its own; None: at 0.
+    with a clock, the time at which runs begin, unless each has its own; None: 0.
     """
 
     shared: list[Array]
@@ -166,11 +166,11 @@ class Common(eqx.Module):
 
 
 class _Block(eqx.Module):
-    """Runs that lie ready: no more than there are lanes.
+    """The next runs of the queue: no more than there are lanes.
 
-    rows: their columns [lanes] of the queue; first: the number of the first one; available: how
-    many they are. until: the pass before which work on them ends; drain: whether it goes on until
-    all lanes are idle, and not only until these runs are taken.
+    rows: their columns [lanes] of the queue; first: number of the first one; available: number of
+    these runs. until: number of the pass before which the inner loop ends; drain: whether it goes
+    on until all lanes are idle, and not only until these runs are taken.
     """
 
     rows: tuple[Array, ...]
@@ -181,10 +181,10 @@ class _Block(eqx.Module):
 
 
 class _Desk(eqx.Module):
-    """The stream, and what its lanes have handed in: no more than there are lanes.
+    """The stream, and the results that its lanes have handed in: no more than there are lanes.
 
-    taken: how many runs, from the block that lies ready; filled: how many numbers of runs, and rows
-    of the columns of results, were handed in.
+    taken: how many runs of the block were taken; filled: how many results were handed in; numbers,
+    columns: the numbers of their runs, and the results, arrays [lanes].
     """
 
     stream: Stream
@@ -195,13 +195,13 @@ class _Desk(eqx.Module):
 
 
 def _floats_of(desk: _Desk) -> _Desk:
-    """The numbers of a desk that may have derivatives; None in place of all others."""
+    """The leaves of a desk that may have derivatives; None in place of all others."""
     floats = eqx.filter(desk, eqx.is_inexact_array)
     return eqx.tree_at(lambda d: d.stream, floats, differentiable(desk.stream))
 
 
 def _refill(program: Program, common: Common, block: _Block, desk: _Desk) -> _Desk:
-    """Hand in what is done and take new runs."""
+    """Hands in the results of finished runs and starts new runs in free lanes."""
     observer, ones = program.observer, desk.stream.ones
     slots = jnp.arange(ones.size, dtype=jnp.int32)
     lanes, passes = desk.stream.lanes, desk.stream.passes
@@ -209,7 +209,7 @@ def _refill(program: Program, common: Common, block: _Block, desk: _Desk) -> _De
     lanes = _give_up(observer.watch_rarely(osc, lanes, ones), passes, common.limit)
     finished = lanes.done & (lanes.run >= 0)
     finished = finished & (_rank(finished) < ones.size - desk.filled)
-    # In order, behind what is there.
+    # Finished lanes in order, behind the results that are already there.
     source = jnp.searchsorted(_rank(finished), slots - desk.filled)
     new = [lanes.run, *_columns(_handed_in(observer, osc, lanes))]
     pairs = zip([desk.numbers, *desk.columns], new, strict=True)
@@ -238,8 +238,8 @@ def _refill(program: Program, common: Common, block: _Block, desk: _Desk) -> _De
 
 
 def _work(program: Program, common: Common, stream: Stream, slopes: Sequence[Stream]):
-    """The stream after ROUNDS_PER_PASS times some steps, each time past the events at first, and
-    its derivatives, one for each direction."""
+    """The stream after ROUNDS_PER_PASS rounds, each a passage of events and STEPS_PER_ROUND
+    steps, and its derivatives, one for each direction."""
     observer, ones = program.observer, stream.ones
     t1, rtol = common.t1, common.rtol
     rules = dict(captures=program.captures, derivatives=program.derivatives)
@@ -285,8 +285,9 @@ def _at_work(stream: Stream) -> Array:
 def _fill(program: Program, common: Common, block: _Block, desk: _Desk, slopes):
     """The inner loop: works until the block of runs is taken, the desk is full, or the last pass.
 
-    slopes: of the block's rows and of the desk, (rows, desk) for each direction. Returns the desk
-    and its derivatives. It closes over no array, so that it can be one piece of machine code.
+    slopes: derivatives of the block's rows and of the desk, (rows, desk) for each direction.
+    Returns the desk and its derivatives. It closes over no array, so that it can be one piece of
+    machine code.
     """
 
     def unfinished(state):
@@ -316,7 +317,7 @@ def _fill(program: Program, common: Common, block: _Block, desk: _Desk, slopes):
 
 
 class Call(eqx.Module):
-    """What the kernel is called for: numbers, all but `drain` int32.
+    """The arguments of one call of the kernel: scalars, all but `drain` int32.
 
     first: number of the first run in the queue; count: how many runs there are; taken: how many of
     them earlier calls took; passes: how many passes of the loop this call may make; drain: whether
@@ -331,7 +332,7 @@ class Call(eqx.Module):
 
 
 def advance(program: Program, common: Common, queue, call: Call, streams):
-    """Work through the queue, or as far as the call's passes go.
+    """Works through the queue, or as far as the call's passes go.
 
     queue: [1 + directions, columns, runs + lanes], the starts and the parameters that differ, and
     their derivatives; streams: the stream, and its derivatives, see `differentiable`, in each
@@ -341,16 +342,15 @@ def advance(program: Program, common: Common, queue, call: Call, streams):
 
     Two loops, because on the CPU only loops on small arrays can be one kernel. The inner loop sees
     small ones only: as many new runs, and as many results, as there are lanes. On accelerators
-    these are as many as a device does at once, nothing is written to places that lanes choose, so
-    that no write waits for another, and nothing but the conditions of the two loops is for the host
-    to look at.
+    there are as many lanes as a device does at once, nothing is written to places that lanes choose
+    (no write waits for another), and the host has to read the conditions of the two loops only.
     """
     program = replace(program, derivatives=len(queue) > 1)
     width, columns = streams[0].ones.size, _columns_of(program, common.shared)
     size = queue.shape[-1] + 2 * width
     one_piece = one_kernel(functools.partial(_fill, program))
     columns_of_queue = [tuple(own) for own in queue]
-    # Differences of pass numbers stay right where they overflow.
+    # Pass numbers may overflow; their differences stay right.
     until = streams[0].passes + call.passes
 
     def rows_at(taken, columns):
@@ -393,17 +393,17 @@ def advance(program: Program, common: Common, queue, call: Call, streams):
 
 
 def _columns_of(program: Program, shared) -> int:
-    """How many columns the results have."""
+    """Number of columns of the results."""
     return sum(math.prod(shape) for shape in layout(program, shared).values())
 
 
 def _rank(flags: Array) -> Array:
-    """How many flags are set before each one."""
+    """For each set flag, the number of set flags before it."""
     return jnp.cumsum(flags.astype(jnp.int32)) - 1
 
 
 def _give_up(lanes: Lanes, passes, limit) -> Lanes:
-    """End runs that took too many steps, or whose state is not finite."""
+    """Ends runs that took too many steps, or whose state is not finite."""
     finite = are_finite(lanes)
     lost = ~lanes.done & (~finite | (passes - lanes.first_pass > limit))
     reason = jnp.where(finite, Status.TOO_MANY_STEPS.value, Status.NOT_FINITE.value)
@@ -418,7 +418,7 @@ def layout(program: Program, shared: list[Array]) -> dict[str, tuple[int, ...]]:
 
 @functools.lru_cache(maxsize=128)
 def _layout(program: Program, shared: tuple[Any, ...]) -> dict[str, tuple[int, ...]]:
-    """The layout of a program; shared: shape and type of what does not vary."""
+    """The layout of a program; shared: shape and type of each leaf that does not vary."""
 
     def finish(shared):
         stream = idle(program, shared, 1, program.columns)

@@ -15,8 +15,8 @@ from .observers import RunEnd, RunEvent
 
 
 def check_reducer(reducer: Any, osc: Oscillator) -> None:
-    """Raises a `ValueError`, or a `TypeError`, that names the method of `observe` that is not as
-    `sweep` describes it."""
+    """Raises a `ValueError` or `TypeError` if a method of the reducer is not as `sweep` describes
+    it; the message names the method."""
     number, code = jax.ShapeDtypeStruct((), jnp.float64), jax.ShapeDtypeStruct((), jnp.int64)
     moment = integrals = None
     if hasattr(reducer, "at") or hasattr(reducer, "rates"):
@@ -67,12 +67,12 @@ def check_reducer(reducer: Any, osc: Oscillator) -> None:
 
 
 def _number_kept(new: Any, old: Any) -> Any:
-    """A number of a state, in the type in which `lanes.choose` keeps it."""
+    """A number of the new state, with the type that `lanes.choose` gives it."""
     return jnp.where(True, new, old)
 
 
 def _require_type(condition: Any, field: str, expected: str, came: str) -> None:
-    """`require` for what is of a wrong type: a `TypeError`."""
+    """Like `require`, but raises a `TypeError`."""
     if not condition:
         raise TypeError(f"{field} must be {expected}, got {came}")
 
@@ -91,7 +91,7 @@ def check_sections(moments: Sequence[Any], osc: Oscillator) -> None:
 
 
 def _tried(name: str, arguments: str, method: Callable, *args: Any) -> Any:
-    """Shapes of what a method returns."""
+    """Shapes of what a method of the reducer returns, or a `ValueError` that names the method."""
     return _shape_of(f"observe.{name}", f"a method of {arguments}", method, *args)
 
 

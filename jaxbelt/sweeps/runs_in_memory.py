@@ -23,7 +23,7 @@ def results_of(
     **numbers: Any,
 ) -> dict[str, np.ndarray]:
     """Results of runs by name, [runs, ...], in the order of the runs; arguments as for
-    `threads.run`; numbers: t1, rtol, atol, and more of its numbers."""
+    `threads.run`; numbers: its keyword arguments, t1, rtol, atol and more."""
     shapes = layout(program, shared)
     columns = np.zeros((sum(math.prod(shape) for shape in shapes.values()), runs))
 
@@ -37,8 +37,8 @@ def results_of(
 def results_from(
     own: OwnOscillator, observer: Observer, starts: np.ndarray, **numbers: Any
 ) -> dict[str, np.ndarray]:
-    """`results_of` of one oscillator, as of `in_units_of_run`, from starts (x1, x2), [2, runs], or
-    (x1, x2, t), [3, runs]; numbers: t1, rtol, atol, t0."""
+    """`results_of` for one oscillator as from `in_units_of_run`, from starts (x1, x2), [2, runs],
+    or (x1, x2, t), [3, runs]; numbers: t1, rtol, atol, t0."""
     leaves, structure = jax.tree.flatten(own)
     mapped, own_t0 = (False,) * len(leaves), len(starts) == 3
     program = Program(structure, mapped, observer, has_edges(own), own_t0=own_t0)

@@ -161,9 +161,9 @@ def numbers_of_attractors(
 
     Args:
         kinds: Codes, [points, runs].
-        sticks: What else distinguishes masses that are stuck for ever, [points, runs, ..].
+        sticks: Codes that distinguish attractors of masses stuck for ever, [points, runs, ..].
         runs: Places of the attractors.
-        oscillator: Returns the oscillator of a point, where shooting has to decide.
+        oscillator: Returns the oscillator of a point; None: an error where shooting has to decide.
 
     Returns:
         The numbers, [points, runs].
@@ -192,7 +192,7 @@ def _decided(
     """The numbers at a point after shooting has decided which of the pairs are one cycle."""
     cycles, decided = {}, labels.copy()
     for number in sorted({number for pair in pairs for number in pair}):
-        # From where the cycle turns back: there it is known best.
+        # Shooting starts where the cycle turns back, at (x1_max, 0): runs know this state best.
         x1_max = places[np.argmax(labels == number), 1]
         cycles[number] = cycle_from(osc, jnp.asarray(np.array([x1_max, 0.0])))
         if int(cycles[number].status) != Status.OK or not bool(cycles[number].stable):
@@ -207,7 +207,7 @@ def _decided(
 
 
 def _doubts(kinds: np.ndarray, labels: np.ndarray, runs: Runs) -> dict[int, list[tuple[int, int]]]:
-    """For each point the pairs of numbers that may belong to one cycle."""
+    """For each point in doubt the pairs of numbers that may belong to one cycle."""
     rows = np.arange(len(labels))
     numbers = range(int(labels.max(initial=-1)) + 1)
     there = [(rows, np.argmax(labels == number, axis=1)) for number in numbers]

@@ -109,7 +109,7 @@ class Store:
         try:
             with cls.opened(path, question) as store:
                 store.finish()
-        except BlockingIOError:  # by a process that does another part again, or finishes the store
+        except BlockingIOError:  # another process does a part again, or finishes the store
             pass
         return store
 
@@ -120,7 +120,7 @@ class Store:
         part: tuple[int, int] | None = None,
         known: str | None = None,
     ):
-        """known: hash of the question, where another process compared all of it."""
+        """known: hash of the question, if another process has already compared all of it."""
         self.path, self.question, self.table = path, question, question.table
         self.root = _open(path)
         self.hash = self.root.attrs["jaxbelt_hash"]
@@ -181,11 +181,11 @@ class Store:
 
     @property
     def runs(self) -> int:
-        """Number of runs in the blocks to do."""
+        """Number of runs in the blocks of this part."""
         return sum(map(self.blocks.size, self.part))
 
     def done(self) -> int:
-        """Number of these that are in the store."""
+        """Number of runs of this part that are in the store."""
         return sum(self.blocks.size(block) for block in self.part if self.is_done(block))
 
     def interrupted(self) -> str:
@@ -209,7 +209,7 @@ class Store:
         return found
 
     def finish(self) -> None:
-        """Numbers the categories whose codes are all known, and marks the store as finished."""
+        """Numbers the categories, as all codes are known now, and marks the store as finished."""
         if self.finished:
             return
         for name in self.table.numbered():
@@ -272,10 +272,10 @@ def _consolidate(path: Path) -> None:
 
 
 def _array(root: Any, name: str, numbered: bool = False) -> Any:
-    """Array of a variable; for one that is numbered, that of its codes or its numbers."""
+    """Array of a variable; of a numbered category that of its codes or, if `numbered`, numbers."""
     codes = f"{name}_codes"
     array = root["ledger"][codes] if codes in root["ledger"] and not numbered else root[name]
-    # A chunk of NaN only has to be written, too, to count as done.
+    # A chunk of fill values only, such as NaN, has to be written, too, to count as done.
     return array.with_config({"write_empty_chunks": True})
 
 
@@ -296,7 +296,7 @@ def _check_folder(path: Path) -> None:
 
 @contextmanager
 def _writes(path: Path) -> Iterator[None]:
-    """Makes an error of the system say that the store could not be written."""
+    """Adds to an error of the operating system that the store cannot be written."""
     try:
         yield
     except BlockingIOError:
@@ -365,7 +365,7 @@ def _create(path: Path, question: Question) -> None:
     if not (path.exists() and path.samefile(Path.cwd())):
         os.replace(new, path)
         return
-    # The working folder has to stay. What makes it a store comes last.
+    # The working folder cannot be replaced. `zarr.json`, which makes it a store, is moved last.
     for part in sorted(new.iterdir(), key=lambda part: part.name == "zarr.json"):
         os.replace(part, path / part.name)
     new.rmdir()
@@ -375,7 +375,7 @@ def _ledger_rows(path: Path, ledger: Any) -> np.ndarray:
     """The ledger's rows of all blocks."""
     try:
         return np.array(ledger["blocks"][:])
-    except Exception as error:  # whatever a codec raises for bytes that are not its own
+    except Exception as error:  # codecs raise all kinds of errors for damaged bytes
         raise ValueError(
             f"store must have a ledger that can be read, got a harmed one in {path} ({error}); "
             f"`jaxbelt verify {path} --repair` finds what is left of it"
@@ -389,7 +389,7 @@ def _identity(question: Question, blocks: Blocks) -> dict[str, str]:
 def _check_question(path: Path, root: Any, question: Question) -> None:
     """Raises unless the store is of this very sweep, and names what differs."""
     there = json.loads(root.attrs["jaxbelt_question"])
-    # A store keeps the blocks that it was made with.
+    # A store keeps the size of blocks that it was made with.
     here = _identity(question, Blocks(question.grid.shape, root["ledger"].attrs["block"]))
     for name in dict.fromkeys([*there, *here]):
         axis = name.removeprefix("axis ")
@@ -400,7 +400,7 @@ def _check_question(path: Path, root: Any, question: Question) -> None:
                 pair = root[axis][:].tolist(), question.grid.axes[axis].tolist()
             else:
                 pair = [str(there.get(name))], [str(here.get(name))]
-                # the leaves of an oscillator, for example
+                # Long texts, such as the leaves of an oscillator, are compared by entries.
                 if max(map(len, pair[0] + pair[1])) > 80:
                     pair = pair[0][0].split(", "), pair[1][0].split(", ")
             raise ValueError(
@@ -539,5 +539,5 @@ def _state(root, ledger, arrays, block: int, place: tuple[slice, ...], finished:
             shown = np.asarray(_array(root, name, numbered=True)[place])
             right = right and np.array_equal(renumber(codes, numbers), shown)
         return "done" if right else "bad"
-    except Exception:  # whatever a codec raises for bytes that are not its own
+    except Exception:  # codecs raise all kinds of errors for damaged bytes
         return "bad"

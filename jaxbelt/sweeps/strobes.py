@@ -1,9 +1,9 @@
-"""Labels of what forced runs lead to, by a look once in each period of the forcing.
+"""The observer of attractors of forced runs, from their states once in each period of the forcing.
 
-At these moments, the strobes, everything that knows the time is as it was a period before: a motion
-repeats if its state at a strobe is that at an earlier one. `ForcedAttractor` looks for such repeats
-and ends a run as soon as it knows one. Where there is none until the end of the run, its largest
-exponent decides.
+At these moments, the strobes, all forces, velocities and loads are as they were a period before: a
+motion repeats if its state at a strobe is that at an earlier one. `ForcedAttractor` looks for such
+repeats and ends a run as soon as one is certain. Where there is none until the end of the run, its
+largest exponent decides.
 """
 
 from collections.abc import Mapping
@@ -30,9 +30,9 @@ from .winding import Winding
 #: Kinds of attractors of forced oscillators, in the order of their codes.
 FORCED_KINDS = ("undecided", "equilibrium", "periodic", "stuck", "quasiperiodic", "chaotic")
 PERIODIC, QUASIPERIODIC, CHAOTIC = 2, 4, 5
-#: Code of a motion that is one of a continuum; it becomes undecided at the end.
+#: Internal code of a motion in a continuum of such; `finish` reports it as undecided.
 FORCED_CONTINUUM = len(FORCED_KINDS)
-#: Results that are those of a cycle without forcing.
+#: Results that `Attractor` has, too.
 OF_LOOPS_AND_MOTIONS = (
     "sticks",
     "period",
@@ -45,44 +45,45 @@ OF_LOOPS_AND_MOTIONS = (
 
 #: States at two strobes are the same if they differ by less than this, over the size of the motion.
 SAME = 1e-6
-#: Differences below so many tolerances of a step are its errors.
+#: Differences below this many tolerances of a step count as errors of integration.
 ERRORS = 10.0
-#: Strobes over which a motion has to repeat, twice its period at least, before it is periodic.
+#: Strobes, and twice its period at least, over which a motion must repeat to count as periodic.
 CONFIRMED = 16
-#: A point of the motion is another one where it is so many times as far away as the motion still
-#: has to go, and so many times as far as errors.
+#: Two points of a motion are distinct if they differ by more than APART times the rest of its
+#: approach plus APART_OF_ERRORS times the errors.
 APART, APART_OF_ERRORS = 10.0, 1000.0
-#: Strobes after which a state is no longer waited for at first; then twice as many, and so on.
+#: Strobes for which the first reference state is kept without a repeat; each next one twice as
+#: long as the last.
 FIRST_PATIENCE = 8
-#: Standard errors within which an exponent is zero; per period the error of its computation, and
-#: how large both may be together where a motion is quasiperiodic.
+#: An exponent is zero within so many standard errors, or within its error of computation per
+#: period; for a quasiperiodic motion the larger of the two has to be below RESOLVED per period.
 DEVIATIONS, COMPUTED, RESOLVED = 3.0, 1e-12, 0.01
-#: The largest distances from the origin in the two halves of a run differ by no larger part in a
-#: quasiperiodic motion, and in a chaotic one; else it has not settled, or grows without bound.
+#: Largest relative difference between the two halves of a run in the largest distance from the
+#: origin, quasiperiodic and chaotic; beyond it the motion has not settled, or grows without bound.
 STEADY, STEADY_CHAOS = 0.01, 0.2
-#: The logarithm of how much a tangent grows, at least, while the exponent of chaos is measured: a
-#: motion that grew as much would be seen to grow.
+#: Least growth of a tangent, its logarithm, while the exponent of chaos is measured: a motion that
+#: itself grew as much would be seen to grow.
 GROWTH_OF_CHAOS = 10.0
-#: Growth of a tangent, its logarithm, that is rounding; its error in a unit of time, which hardly
-#: depends on the tolerance: 4e-6 were seen with steep laws of friction, 1e-9 with Coulomb's. For
-#: complex multipliers areas tell it, in which errors are smaller.
+#: Growth of a tangent, its logarithm, that is rounding; its error per unit of time, which hardly
+#: depends on the tolerance: 4e-6 were seen with steep laws of friction, 1e-9 with Coulomb's. The
+#: modulus of complex multipliers follows from areas, in which errors are smaller.
 STILL, ERRORS_OF_GROWTH, ERRORS_OF_AREAS = 1e-9, 1e-5, 1e-7
-#: Shares of the time that the mass does not stick, and differences of states, that are rounding.
+#: Share of the time without sticking, and difference of states, that count as rounding.
 CARRIED, STANDS_STILL = 1e-9, 1e-13
-#: An extremum is known from a point that is this near in time; steps are cut until there is one.
-#: Where x1 or x2 change by less in a quarter of a step, times `blur` and the size of the motion,
-#: what seems to be one is rounding, as in a stick phase.
+#: An extremum is computed from a point this near in time; steps are cut until there is one. Where
+#: x2 or its slope changes by less than HARDLY_CHANGES, times `blur` and the size of the motion, in
+#: a quarter of a step, an apparent extremum is rounding, as in a stick phase.
 NEAR_EXTREMUM, HARDLY_CHANGES = 1e-3, 1e-13
 
 
 class _Repeats(eqx.Module):
     """The search for a repeat, arrays [lanes].
 
-    x1, x2: the state that later ones are compared with, of the strobe `at`; patience: strobes until
-    it is given up; n: strobes after which the motion seems to repeat, 0: not yet; confirmed:
-    strobes over which it has; asked: how many these were when half of them were over, 0: before;
-    log, d1, d2: growth and direction of the tangent at their half; moved: how far the last repeat
-    was from its own; nearest: the smallest distance of another strobe.
+    x1, x2: the reference state, of the strobe `at`; patience: strobes without a repeat after which
+    it is replaced; n: strobes after which the motion seems to repeat, 0: none yet; confirmed:
+    strobes over which it has; asked: `confirmed` when half of the strobes needed were over, 0:
+    before; log, d1, d2: growth and direction of the tangent at that time; moved: distance of the
+    last repeat from its reference state; nearest: smallest distance of a strobe in between.
     """
 
     x1: Array
@@ -100,10 +101,10 @@ class _Repeats(eqx.Module):
 
 
 class _Extent(eqx.Module):
-    """What is known of the motion since the state of `_Repeats`, arrays [lanes].
+    """The motion since the reference state of `_Repeats`, arrays [lanes].
 
-    low, high: least and largest (x1, x2); sticks: time stuck to each belt; events, rises: their
-    numbers at the beginning; top: the strobe with the largest x1, (x1, x2).
+    low, high: least and largest (x1, x2); sticks: time stuck to each belt; events, rises: number of
+    events, and `Winding.rises_begun`, at that state; top: (x1, x2) at the strobe of largest x1.
     """
 
     low: tuple[Array, Array]
@@ -129,10 +130,10 @@ class _Extent(eqx.Module):
 class _RunSoFar(eqx.Module):
     """Memory of the observers, arrays [lanes].
 
-    strobes: number of the next strobe, counted from t = 0; turns: `common_turns` between two,
-    0: the frequencies have no period in common. farthest: largest distance from the
-    origin in each half of the time in which exponents are measured. kind, periods, loop_events,
-    loop_rises: of the attractor, once known; transient: the time when it was.
+    strobes: number of the next strobe, counted from t = 0; turns: periods of the clock between two
+    strobes, see `common_turns`, 0: the frequencies have no common period. farthest: largest
+    distance from the origin in each half of the time in which exponents are measured. kind,
+    periods, loop_events, loop_rises: of the attractor, once known; transient: the time then.
     """
 
     strobes: Array
@@ -150,19 +151,19 @@ class _RunSoFar(eqx.Module):
 
 
 class ForcedAttractor(Observer):
-    """What a forced run leads to; it ends as soon as that is known.
+    """Observer of the attractor that a forced run leads to; the run ends once it is known.
 
     - A periodic motion: its states at strobes repeat, all of them, over `CONFIRMED` strobes and two
-      of its periods; no state in between is the same; what is left of the approach, by the rate at
+      of its periods; no state in between is the same; the rest of the approach, by the rate at
       which it shrinks, is below `SAME` of its size; and multipliers show that it attracts.
     - None of these: one of a continuum of motions, where a tangent keeps its size while the motion
-      repeats, or always. It attracts nothing, and the run ends undecided with the status NEUTRAL.
+      repeats, or over the whole run. It attracts nothing: the run ends undecided, NEUTRAL.
     - Stuck for ever, or at rest on an edge that pushes back from both sides at all times.
-    - Where no repeat is found until the end of the run its largest exponent decides: it is chaotic
-      where that is more than three standard errors above zero, quasiperiodic where it is zero
-      within these, nothing seems to repeat, and the mass never sticks or the maxima of x1 keep
-      their order on the circle of phases. Else it is undecided, with the status NOT_SETTLED; so is
-      a motion that still grows or shrinks.
+    - Where no repeat is found until the end of the run its largest exponent decides: the motion is
+      chaotic where the exponent is more than three standard errors above zero, quasiperiodic where
+      it is zero within these, nothing seems to repeat, and the mass never sticks or the maxima of
+      x1 keep their order on the circle of phases. Else it is undecided, with the status
+      NOT_SETTLED; so is a motion that still grows or shrinks.
     """
 
     variables: ClassVar[Mapping[str, Variable]] = {
@@ -224,7 +225,7 @@ class ForcedAttractor(Observer):
         new = choose(cut, replace(lanes, h=theta * course.duration), new)
         h = jnp.where(cut, 0.0, course.duration)
         growth = grown(osc, seen.growth, lanes, course, h, ones)
-        # What is known stays until the lane hands it in.
+        # Decided lanes keep their results until these are collected.
         going_on = seen.kind == UNDECIDED
         extent = self._extended(seen.extent, lanes, new, course)
         seen = replace(seen, growth=growth, extent=choose(going_on & ~cut, extent, seen.extent))
@@ -244,7 +245,7 @@ class ForcedAttractor(Observer):
         return replace(new, memory=self._strobed(osc, seen, new, due, rtol))
 
     def _extended(self, extent: _Extent, lanes: Lanes, new: Lanes, course: Course) -> _Extent:
-        """The extent with a step: with both of its ends, and with extrema near to one of them."""
+        """The extent with a step added: both of its ends, and extrema near to one of them."""
         h = course.duration
         sticks = tuple(
             total + jnp.where(one, h, 0.0)
@@ -264,8 +265,8 @@ class ForcedAttractor(Observer):
         return extent
 
     def _cut(self, seen: _RunSoFar, course: Course, t: Array, ones: Array) -> Array:
-        """The fraction of a step to the time t that ends at its first extremum of x1 or x2; 1 where
-        there is none inside, or where none is wanted."""
+        """The fraction of a step to the time t at which its first extremum of x1 or x2 lies; 1
+        where none is inside, or where the lane needs none."""
         h = course.duration
         theta = jnp.ones_like(h)
         asked = (seen.repeats.n > 0) & (seen.kind == UNDECIDED) & (h > NEAR_EXTREMUM)
@@ -287,7 +288,7 @@ class ForcedAttractor(Observer):
     def _strobed(
         self, osc: OwnOscillator, seen: _RunSoFar, lanes: Lanes, due: Array, tol: Array
     ) -> _RunSoFar:
-        """The memory behind a strobe, where one is due."""
+        """The memory behind a strobe in lanes where one is due."""
         now, known = seen.strobes, seen.repeats
         extent, x1, x2 = seen.extent, lanes.x1, lanes.x2
         is_top = x1 > extent.top[0]
@@ -313,18 +314,18 @@ class ForcedAttractor(Observer):
         here = (known.n > 0) & ~turn
         nearest = jnp.where(here, jnp.minimum(known.nearest, away), known.nearest)
         settled = (away <= errors) | (left <= close)
-        # Errors hide how far it still goes where it comes nearer slowly, from both sides in turn.
+        # Errors hide the rest of a slow approach from alternate sides.
         still = jnp.where(away <= errors, 0.0, APART * left)
         alone = (known.n == 1) | (nearest > still + APART_OF_ERRORS * errors)
         least = jnp.maximum(CONFIRMED, 2 * known.n)
         found = again & settled & alone & (confirmed >= least)
-        # A mass that a belt carries is where it was if nothing but rounding says otherwise.
+        # A mass that sticks all the time repeats only if its state is equal up to rounding.
         elapsed = since.astype(x1.dtype) * _strobe_period(osc, seen.turns)
         carried = sum(extent.sticks) >= (1 - CARRIED) * elapsed
         found = found & (~carried | (away <= STANDS_STILL * (1 + jnp.abs(x1))))
-        # Nothing pulls a motion to one that lies beside others which repeat as well, and one from
-        # which a tangent leads away is no attractor. A tangent may be lost in a stick phase on the
-        # way, once; so multipliers are those of the second half of these strobes.
+        # A motion in a continuum of motions that repeat attracts nothing, and one with a growing
+        # tangent is no attractor. A tangent may vanish in a stick phase of the transient, once; so
+        # multipliers are those of the second half of the strobes over which the motion repeats.
         growth = seen.growth
         vanished = growth.size == -jnp.inf
         gained, is_complex = growth.multiplier_since(known.d1, known.d2, known.log)
@@ -440,12 +441,12 @@ class ForcedAttractor(Observer):
 
 
 def _strobe_period(osc: OwnOscillator, turns: Array) -> Array:
-    """Time between two strobes; a turn where there is no period."""
+    """Time between two strobes; one period of the clock where there is no common period."""
     frequency = jnp.abs(clock_frequency(osc))
     return 2 * np.pi * jnp.maximum(turns, 1).astype(frequency.dtype) / frequency
 
 
 def _way_to_zero(value: Array, slope: Array, h: Array) -> Array:
-    """Time to where a value vanishes, 0 where that is farther than `NEAR_EXTREMUM`."""
+    """Time to where a value of this slope vanishes, 0 if farther than `NEAR_EXTREMUM`."""
     way = step_to_root(value, slope)
     return jnp.where((jnp.abs(way) <= NEAR_EXTREMUM) & (h > 0), way, 0.0)

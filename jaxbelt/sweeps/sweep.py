@@ -114,7 +114,7 @@ def sweep(
         t0: Time at which each run begins, which matters where the oscillator is forced.
         rtol: Relative tolerance of a step.
         atol: Absolute tolerance of a step, a length; None: 1e-8 of the oscillator's own size.
-        observe: What to observe: `"final"`, `"attractor"` or an object, see above.
+        observe: What to observe: `"final"`, `"attractor"`, `"lyapunov"` or an object, see above.
         derivatives: Names of axes. Each adds `d_<variable>_d_<axis>` for every variable that is a
             float, by forward mode; NaN where the variable is not finite.
         store: Folder for the results, a Zarr group that `xarray.open_zarr` opens. It is of another
@@ -169,9 +169,9 @@ def sweep(
 
 @contextmanager
 def _explained_ends() -> "Iterator[list[Memory | Store]]":
-    """Makes an interrupt, or a full disk, say what becomes of the runs, whenever it comes.
+    """Adds what becomes of the runs to the message of an interrupt, or of a full disk.
 
-    Yields a list for the results, once there is a place for them.
+    Yields a list to which the caller adds the `Memory` or `Store` once it exists.
     """
     known: list[Memory | Store] = []
     try:
@@ -200,7 +200,7 @@ def _kept(
     audit: float,
     known: list[Memory | Store],
 ) -> "xarray.Dataset":
-    """Does the sweep in a store, or that part of its blocks."""
+    """Does the sweep, or a part of its blocks, in a store, and returns the dataset."""
     with Store.opened(path, question, part) as results:
         known.append(results)
         if results.to_do:
@@ -226,7 +226,7 @@ def _do_and_show(
 
 
 def _check_where(question: Question, store, executor, blocks, audit: float) -> None:
-    """Raises unless blocks can be done there."""
+    """Raises a `ValueError` unless store, executor, blocks and audit fit together."""
     for name, value in (("executor", executor), ("blocks", blocks)):
         wanted = f"given, where {name} is: blocks are written there one by one"
         require(value is None or store is not None, "store", wanted, "None")

@@ -26,15 +26,15 @@ from ..numerics.compiling import wide
 from ..numerics.widths import SideBySide, as_here, is_cpu
 from .queue import ROUNDS_PER_PASS, Call, Common, advance, differentiable, idle
 
-#: Steps that a run may take for each 100 units of time before it is given up. On its way to a
-#: pseudo-focus beside a slow belt it may pass ten thousand events in that time.
+#: Steps that a run may take for each 100 units of time before it ends, TOO_MANY_STEPS. On its way
+#: to a pseudo-focus beside a slow belt it may pass ten thousand events in that time.
 STEP_BUDGET = 400_000
-#: Runs that the kernel gets at once: enough that a call costs nothing beside them, and few enough
+#: Runs that the kernel gets at once: enough that the cost of a call is negligible, and few enough
 #: that the threads end together.
 CHUNK = SideBySide(on_cpu=2**14, elsewhere=2**20)
 #: Number of lanes, large enough that a refill is cheap for each.
 WIDTH = SideBySide(on_cpu=128, elsewhere=2**20)
-#: Few runs have fewer lanes, by powers of `COARSER`, so that few programs are compiled.
+#: Few runs get fewer lanes, in steps of the factor `COARSER`, so that few programs are compiled.
 LEAST_WIDTH = SideBySide(on_cpu=128, elsewhere=2**10)
 COARSER = 32
 #: Seconds within which an interrupt takes effect; a call of the kernel takes half of that or less.
@@ -61,7 +61,7 @@ def workers() -> int:
 
 
 def lanes_for(runs: int) -> int:
-    """Number of lanes for a thread with so many runs to do."""
+    """Number of lanes for a thread that has `runs` runs to do."""
     width = WIDTH.here
     while width // COARSER >= max(runs, LEAST_WIDTH.here):
         width //= COARSER
@@ -139,8 +139,8 @@ def run(
             raise_interrupt()
             watch()
 
-        # Compiled once, before the threads would each do it; not on the thread of the caller, so
-        # that an interrupt need not wait for it.
+        # Compiled once, before the threads begin, and not on the thread of the caller, so that an
+        # interrupt need not wait for the compiler.
         _wait([_started(team.compile, devices[0])], look)
         at_work = [_started(team.work, devices[i % len(devices)]) for i in range(threads)]
         try:
@@ -174,7 +174,7 @@ class _Chunks:
 
 @dataclass
 class _Team:
-    """What the threads of one call of `run` share, see there.
+    """What the threads of one call of `run` share; see its arguments.
 
     room: shape of a queue, with a chunk and one more run for each lane.
     """
@@ -187,7 +187,7 @@ class _Team:
     chunks: _Chunks
     first_passes: int
     stop: threading.Event = field(default_factory=threading.Event)
-    #: Streams that the threads begin with, on each device; a kernel does not change what it gets.
+    #: Empty streams to begin with, by device; threads share them, as a kernel changes no argument.
     streams: dict[Any, Any] = field(default_factory=dict)
 
     def compile(self, device) -> None:
@@ -215,16 +215,16 @@ class _Team:
                 streams, passes = self._chunk(queue, first, last, drain, streams, passes)
 
     def _queue(self) -> np.ndarray:
-        """Room for a chunk, always of one size, so that one compiled kernel serves."""
+        """Zeros with room for a chunk, always of one size, so that one compiled kernel serves."""
         return np.zeros(self.room)
 
     def _chunk(self, queue, first: int, last: int, drain: bool, streams, passes: int):
         """Calls the kernel until a chunk is taken (with `drain`: done).
 
-        A call takes about half of PATIENCE. Returns the streams, and how many passes a call may
-        make.
+        A call takes about half of PATIENCE. Returns the streams, and how many passes the next call
+        may make.
         """
-        # Once for all calls.
+        # Transferred to the device once, for all calls.
         queue, taken, more = jax.device_put(queue), np.int32(0), True
         while more and not self.stop.is_set():
             began = time.monotonic()
@@ -248,8 +248,8 @@ def _settings(device) -> Iterator[None]:
         yield
 
 
-#: Threads at work. They outlive a call only if an interrupt came while one was compiling, as
-#: nothing ends that.
+#: Threads at work. They outlive a call only if an interrupt came while one was compiling,
+#: which nothing can interrupt.
 _alive: set[threading.Thread] = set()
 
 
@@ -274,9 +274,9 @@ def _started(function: Callable, *args: Any) -> Future:
 
 @atexit.register
 def _end_of_process() -> None:
-    """Lets no thread see the end of the interpreter, where the process would be aborted.
+    """Waits for all threads: any alive at the end of the interpreter would abort the process.
 
-    A process that an interrupt ends is ended at once by the signal, as Python does it.
+    A process that ends by an interrupt does not wait: the signal ends it, as Python does.
     """
     if _alive and getattr(sys, "last_type", None) is KeyboardInterrupt:
         sys.stdout.flush()
@@ -287,7 +287,7 @@ def _end_of_process() -> None:
 
 
 def _wait(futures: list[Future], watch: Callable[[], None]) -> None:
-    """Waits until all are done or one has failed, and raises what it raised."""
+    """Waits until all futures are done or one has failed, and raises the error of that one."""
     # With a timeout, as some systems do not interrupt a wait without one.
     while wait(futures, timeout=0.1, return_when=FIRST_EXCEPTION).not_done:
         watch()

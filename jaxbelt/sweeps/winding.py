@@ -1,7 +1,7 @@
 """Winding numbers of forced runs: how many maxima of x1 there are in a period of the forcing.
 
-Where the phases of successive maxima follow one another as by a map of the circle that preserves
-their order, the k-th maximum comes D periods after the first with floor(D)/k <= r <= ceil(D)/k, r
+Where a map of the circle that preserves order takes the phase of each maximum to that of the next
+one, the k-th maximum comes D periods after the first with floor(D)/k <= r <= ceil(D)/k, r
 the mean number of periods between maxima. All these bounds together leave an interval whose ends
 are the neighbours of r among the fractions with denominators up to the number of maxima: between
 them there is no fraction with a smaller denominator than theirs. Bounds that contradict each other
@@ -18,15 +18,15 @@ from ..kernel.lanes import Lanes, materialise
 from ..numerics.implicit import step_to_root
 from .moments import Course
 
-#: Periods between two maxima are a whole number up to this, which the times of maxima err.
+#: A number of periods between maxima is whole up to this, the error of the times of maxima.
 WHOLE = 1e-7
-#: So many maxima are looked at, at least; a motion whose order is kept repeats after no fewer than
-#: one in so many of them, or never.
+#: Least number of maxima by which order is judged; a motion counts as ordered if it repeats, at the
+#: earliest, after one PARTS_OF_MAXIMA-th of its maxima, or never.
 FEWEST_MAXIMA, PARTS_OF_MAXIMA = 256, 16
 #: Where a step lands on a bound of its mode, the sign of a smaller |x2| is rounding: the mass may
 #: come to rest there.
 LANDED = 1e-9
-#: Newton's steps to the time of a maximum within a step.
+#: Number of Newton steps for the time of a maximum within a step.
 STEPS_TO_MAXIMUM = 3
 
 
@@ -59,7 +59,7 @@ class Winding(eqx.Module):
     def followed(
         self, lanes: Lanes, new: Lanes, course: Course, first_at: Array, period: Array, ones: Array
     ) -> "Winding":
-        """With a step; bounds are counted from the first maximum at `first_at` or later on.
+        """The winding after a step; bounds count from the first maximum at `first_at` or later.
 
         Where the mass rests between its rise and its fall, the maximum is where it begins to fall.
         """
@@ -92,13 +92,13 @@ class Winding(eqx.Module):
 
     @property
     def rises_begun(self) -> Array:
-        """How often x1 has begun to rise: as often in each period of a motion that repeats, though
-        rounding decides whether a maximum at a strobe is before or behind it."""
+        """How often x1 has begun to rise: a fixed number of times in each period of a motion, even
+        where rounding decides whether a maximum at a strobe is before or behind it."""
         return self.maxima + self.rises.astype(self.maxima.dtype)
 
     @property
     def is_ordered(self) -> Array:
-        """Whether the maxima keep their order and repeat after many of them only, or never."""
+        """Whether maxima keep their order, and repeat only after many of them or never."""
         count = self.maxima - self.first
         repeats_after = jnp.minimum(self.low_after, self.high_after)
         return (
@@ -108,7 +108,7 @@ class Winding(eqx.Module):
         )
 
     def number(self, ordered: Array) -> Array:
-        """Maxima in a period: by the bounds where they are ordered, else the mean of the run."""
+        """Maxima per period: from the bounds where `ordered`, else from the periods measured."""
         count = (self.maxima - self.first).astype(self.low.dtype)
         between = 0.5 * (self.low + self.high) * count
         periods = jnp.where(ordered, between, self.latest)

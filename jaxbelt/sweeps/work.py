@@ -1,4 +1,4 @@
-"""The work of a sweep: runs through the kernel, by blocks into memory or a store, or one by one."""
+"""The work of a sweep: the runs of its blocks through the kernel, into memory or a store."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -11,7 +11,7 @@ from .queue import column_of
 from .store import Store
 from .threads import run
 
-#: Function that is called with the numbers of further runs by status.
+#: Function that is called with the numbers of newly done runs by status.
 Advance = Callable[[Mapping[int, int]], None]
 
 
@@ -22,14 +22,14 @@ def do_runs(
     advance: Advance,
     **options: Any,
 ) -> None:
-    """Does the runs of some blocks; options: `threads` and `watch` of `threads.run`."""
+    """Does the runs of the blocks `to_do`; options: `threads` and `watch` of `threads.run`."""
     blocks = results.blocks
     ends = np.cumsum([blocks.size(block) for block in to_do])
     starts = np.append(0, ends[:-1])
     status = column_of(question.table.layout, "status")
 
     def parts(numbers: np.ndarray):
-        """Yields for each block which of the numbers are in it, and their positions there."""
+        """For each block yields its number, an index of its `numbers`, their positions in it."""
         if len(to_do) == 1:
             yield to_do[0], slice(None), numbers
             return
