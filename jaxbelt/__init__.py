@@ -32,10 +32,10 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     sweeps/         threads runs_in_memory audit grid datasets question locks store progress work
     sweeps/         clusters sweep shares
     sweeps/         naming forced_basins basins fractions orbit_diagram circle_map
-    bifurcations/   special labels beside systems timed_systems guesses base conditions forced
-    bifurcations/   symmetry forced_edges tangencies crossings rests edge_rests edges folds meetings
-    bifurcations/   connections infinity path scan refine tracks forced_ends changes curves cells
-    bifurcations/   faces bounds regions legs branches pieces diagrams switch_folds
+    bifurcations/   special labels beside systems timed_systems guesses base conditions arc_rows
+    bifurcations/   forced symmetry forced_edges tangencies crossings rests edge_rests edges folds
+    bifurcations/   meetings connections infinity path scan refine tracks forced_ends changes curves
+    bifurcations/   cells faces bounds regions legs branches pieces diagrams switch_folds
     inverse/        selection record search windows fit margins design
     si              results in SI units
     plotting/       style phase histories forced points diagrams regions categories sweeps orbits

@@ -26,8 +26,9 @@ from ..model.own_units import in_own_units
 from ..model.variations import Variation
 from ..motion.arcs import Ends
 from ..results import Status
+from .arc_rows import ArcRows
 from .base import AbstractCondition, BifurcationPoint
-from .forced import AbstractForcedCondition, ArcRows, Beginning, minima_of_guards, without_one_of
+from .forced import AbstractForcedCondition, Beginning, minima_of_guards, without_one_of
 from .timed_systems import ARRIVES, TimedSystem
 
 #: Durations of arcs beyond an edge with which motions beyond a touch are sought, in own units.

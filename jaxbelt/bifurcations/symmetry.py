@@ -17,7 +17,8 @@ from ..cycles.periodic import PeriodicMotion, monodromy_of, periodic_from, state
 from ..model.oscillator import Oscillator, at_time, constant_force
 from ..results import Status
 from .base import Line
-from .forced import ArcRows, Beginning, UnitCircle
+from .arc_rows import ArcRows
+from .forced import Beginning, UnitCircle
 from .timed_systems import SYMMETRIC, OnBreakingSymmetry
 
 #: Fractions of a period at which an oscillator is compared with its image, and the tolerance.
