@@ -4,6 +4,7 @@ Where a belt of constant friction is fast, the mass never comes to its velocity,
 the motion is linear: the force at which it touches is known in closed form.
 """
 
+import jax
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -315,3 +316,36 @@ def test_a_curve_goes_on_where_events_change_whatever_its_step():
     row = next(row for row in curves[0].values[::-1] if row[1] < 0.353 and row[0] < 1.55)
     found = jb.refine(grazing, lambda f: make(f, row[1]), at=row[0] + 1e-3, start=point.cycle)
     assert float(found.value) == pytest.approx(row[0], abs=1e-9)
+
+
+@pytest.mark.slow(first=True)
+def test_a_corner_is_exact_from_far_away_in_every_unit():
+    """Where stick phases vanish at the edge; their durations are those of the events of runs."""
+
+    def make(amplitude, edge=0.5, unit=1.0):
+        law = jb.Conti(1.0, 0.6, 10.0 / unit)
+        belt = jb.Belt(0.3 * unit, law, load=0.5 * unit, upper=edge * unit)
+        return jb.Oscillator(0.1, (belt,), forcing=jb.Harmonic(amplitude * unit, 0.9))
+
+    def corner(edge=0.5, unit=1.0):
+        def family(amplitude):
+            return make(amplitude, edge, unit)
+
+        return jb.refine(jb.CornerCollision(0), family, at=0.6, start=(0.5 * unit, 0.0))
+
+    points = [corner(unit=unit) for unit in (1.0, 10.0, 1e-3)]
+    found = [float(point.value) for point in points]
+    np.testing.assert_allclose(found, found[0], rtol=0, atol=1e-13)
+    assert max(float(point.error) for point in points) < 1e-12
+
+    below, durations, t1 = np.array([4e-5, 2e-5, 1e-5]), [], 120 * np.pi / 0.9
+    for distance in below:
+        run = jb.simulate(make(found[0] - distance), (0.191, 0.536), t1, ts=[t1])
+        last = np.flatnonzero(np.asarray(run.events.kind) == jb.EventKind.STICK)[-1]
+        durations.append(float(run.events.t[last + 1] - run.events.t[last]))
+    # The distance as a function of the duration, by a parabola; runs are good to 1e-12.
+    assert np.polyfit(durations, below, 2)[-1] == pytest.approx(0.0, abs=1e-11)
+
+    slope = (corner(0.501).value - corner(0.499).value) / 0.002  # off by 3e-7
+    derivative = jax.grad(lambda edge: corner(edge).value)(0.5)
+    assert float(derivative) == pytest.approx(float(slope), abs=1e-6)

@@ -62,6 +62,9 @@ AT_ONSET = 1e-6
 ALIKE_ARCS = 0.1
 #: Jumps from static to kinetic friction, and their effects in own units, count as zero below this.
 SMALLEST_JUMP = 1e-6
+#: A point with a larger error, in units of the parameter, is solved again with integration steps
+#: that suit its own motion.
+EXACT_POINT = 1e-11
 #: States from which motions are looked for, in own units.
 STARTS_OF_MOTIONS = (
     (0.5, 0.0),
@@ -135,7 +138,16 @@ class AbstractForcedCondition(AbstractCondition):
         self, variation: Variation, osc: Oscillator, value: Any, beginning: Beginning
     ) -> BifurcationPoint:
         """The point that is found from one guess."""
-        return self.solve(variation, osc, value, beginning)
+        point = self.solve(variation, osc, value, beginning)
+        bound = EXACT_POINT * variation.family(value).unit
+        if int(point.status) != Status.OK or float(point.error) <= float(bound):
+            return point
+        # The integration steps suit the motion at the beginning, which may be far away.
+        near, at, motion = lax.stop_gradient((point.oscillator, point.value, point.cycle))
+        closer = beginning._replace(rows=ArcRows.of(motion))
+        again = self.solve(variation, near, at[None], closer)
+        finer = int(again.status) == Status.OK and float(again.error) < float(point.error)
+        return again if finer else point
 
     def guess(self, osc, size):
         raise NotImplementedError

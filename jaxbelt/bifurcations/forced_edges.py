@@ -14,6 +14,7 @@ from dataclasses import replace
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array
 
 from ..cycles.clocked import TimedChain
@@ -141,7 +142,8 @@ class TimedCorner(AbstractTimedEdge):
         if int(point.status) != Status.OK:
             return point
         # A motion that only touches the edge meets the equations, too.
-        rows, own = ArcRows.of(point.cycle), in_own_units(point.oscillator)
+        motion, osc = lax.stop_gradient((point.cycle, point.oscillator))
+        rows, own = ArcRows.of(motion), in_own_units(osc)
         touches = any(
             _off_edge(own, rows, row, edge) < ON_THE_EDGE
             for edge, _ in self.ends_of_edges(own)

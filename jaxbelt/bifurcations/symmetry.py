@@ -16,8 +16,8 @@ from ..cycles.clocked import forcing_period
 from ..cycles.periodic import PeriodicMotion, monodromy_of, periodic_from, state_near_start
 from ..model.oscillator import Oscillator, at_time, constant_force
 from ..results import Status
-from .base import Line
 from .arc_rows import ArcRows
+from .base import Line
 from .forced import Beginning, UnitCircle
 from .timed_systems import SYMMETRIC, OnBreakingSymmetry
 
