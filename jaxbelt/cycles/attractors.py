@@ -3,12 +3,12 @@
 The events of one loop do not identify a cycle: there may be two cycles with one sequence of events.
 Two properties do:
 
-- Its itinerary: the modes that it passes, whole ones, with the contact of every belt in each. So it
-  says on which side of every contact edge the mass sticks, and with which sign of r it slips. A
-  stick phase ends at a place that its modes determine, and the orbit goes on from there in one way
-  only: of cycles that stick there is one with each itinerary.
-- Its place: its extent, and its period. Orbits that do not stick do not meet, so of two such cycles
-  one lies inside of the other, or beside it.
+- Its itinerary: the sequence of its modes, each with the contact code of every belt. So it tells on
+  which side of every contact edge the mass sticks, and with which sign of r it slips. The modes
+  determine where a stick phase ends, and from there the orbit continues in one way only: there is
+  at most one sticking cycle with each itinerary.
+- Its place: its extent in x1 and x2, and its period. Orbits that do not stick never meet, so of two
+  such cycles one lies inside the other, or beside it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,32 +30,32 @@ from .cycle import Cycle
 if TYPE_CHECKING:
     import xarray
 
-#: The modes of one loop, contact codes of all belts each, beginning with the least of their orders.
+#: The modes of one loop, each the contact codes of all belts, in their least cyclic order.
 Itinerary = tuple[tuple[int, ...], ...]
-#: Arcs that take no longer exist by rounding only: those between two events at one place take
-#: 1e-26, and where a bifurcation is narrowed to 1e-9 of a span some 1e-9.
+#: Arcs no longer than this exist by rounding only: arcs between two events at one place last 1e-26,
+#: arcs beside a bifurcation that is narrowed to 1e-9 of a span some 1e-9.
 MOMENT = 1e-13
 #: An arc that vanishes as the square of a distance may take more than MOMENT at one value of a
-#: parameter and less at the next one; it counts at both if it takes longer than this.
+#: parameter and less at the next one; it counts at both if it lasts longer than LEAST_MOMENT.
 LEAST_MOMENT = 1e-16
-#: Distance below which two cycles that shooting solved for are the same: its equations hold to
-#: 1e-9, and beside a fold a cycle moves by ten thousand times that.
+#: Distance below which two cycles found by shooting are the same: the shooting equations hold to
+#: 1e-9, and beside a fold a cycle moves by ten thousand times that error.
 SAME_CYCLE = 1e-5
-#: The same for runs of a sweep, times its tolerance: its errors are ten to a thousand times that.
+#: For runs of a sweep this distance is RUN * tolerance: errors are 10 to 1000 times the tolerance.
 RUN = 1e3
-#: Distance below which two motions may be the same: ends of two pieces of one branch; runs whose
-#: distance or events leave it open, which shooting then decides.
+#: Distance below which two motions may be the same: ends of two pieces of one branch, or runs of
+#: which neither distance nor events decide this, so that shooting has to.
 MAYBE_SAME = 1e-2
-#: Distance below which an unstable cycle goes on to one at the next value of a parameter.
+#: Distance below which unstable cycles at two successive values of a parameter are one branch.
 GOES_ON = 0.3
 
 
 def itinerary(idle: np.ndarray, loop: Cycle | Loop, moment: float = MOMENT) -> Itinerary:
-    """The modes of one loop in order, from whatever place it was begun.
+    """The modes of one loop in order, the same whichever arc the loop begins with.
 
-    idle: see `idle_belts`.
-    Modes that last no longer than `moment` are left out: where slip onset lies on an edge rounding
-    decides which comes first.
+    idle: mask [belts] of belts without load, see `idle_belts`.
+    Modes that last no longer than `moment` are left out: where slip onset lies on an edge, rounding
+    decides which of the two events comes first.
     """
     chain, rows = arcs_of(loop)
     modes, lasts = modes_of(chain), rows[:, 2] > moment
@@ -69,26 +69,26 @@ def itinerary(idle: np.ndarray, loop: Cycle | Loop, moment: float = MOMENT) -> I
 
 
 def idle_belts(osc: Oscillator) -> np.ndarray:
-    """Which belts have no load, so that they do nothing, [.., belts]."""
+    """Mask [.., belts] of belts without load, which exert no friction."""
     return np.stack([np.asarray(belt.load) == 0 for belt in osc.belts], axis=-1)
 
 
 def without_idle(idle: np.ndarray, modes: np.ndarray) -> np.ndarray:
-    """Contact codes, [.., belts], in which belts that do nothing are absent."""
+    """Contact codes, [.., belts], in which the idle belts count as not touching."""
     return np.where(idle, int(ABOVE), modes)
 
 
 def sticks(path: Itinerary) -> bool:
-    """Whether the mass sticks to a belt."""
+    """Whether the mass sticks to some belt along this itinerary."""
     return any(0 in mode for mode in path)
 
 
 def stuck_belts(path: Itinerary) -> frozenset[int]:
-    """The belts that the mass sticks to."""
+    """Numbers of the belts that the mass sticks to along this itinerary."""
     return frozenset(belt for mode in path for belt, code in enumerate(mode) if code == 0)
 
 
-#: The dimensions of a place, see `own_units.quantity`.
+#: The dimensions of the five numbers of a place, see `own_units.quantity`.
 PLACE_DIMENSIONS = ("length", "length", "velocity", "velocity", "time")
 
 
@@ -98,7 +98,7 @@ def place_of(cycle: Cycle | Loop) -> np.ndarray:
 
 
 def arcs_of(cycle: Cycle | Loop) -> tuple[Chain | Loop, np.ndarray]:
-    """The arcs of a cycle, and (x1, x2, T) of those that are used, [arcs, 3]."""
+    """The chain or loop of a cycle, and (x1, x2, T) of its used arcs, [arcs, 3]."""
     if isinstance(cycle, Cycle):
         loop, rows = cycle.chain, np.asarray(cycle.unknowns)
     else:
@@ -107,16 +107,16 @@ def arcs_of(cycle: Cycle | Loop) -> tuple[Chain | Loop, np.ndarray]:
 
 
 def extent(rows: np.ndarray) -> np.ndarray:
-    """`place_of` from (x1, x2, T) of the arcs that are used, [arcs, 3]."""
+    """`place_of` from (x1, x2, T) of the used arcs, [arcs, 3]."""
     x1, x2, durations = rows.T
     return np.array([x1.min(), x1.max(), x2.min(), x2.max(), durations.sum()])
 
 
 def distance(place: ArrayLike, other: ArrayLike, least: float = 0.0) -> Any:
-    """Distance between motions by their places, [.., 5], or the first numbers of them.
+    """Relative distance between motions by their places, [.., 5], or the first numbers of places.
 
-    It is relative to the size of the larger motion, its largest extent; to `least` where that is
-    larger.
+    It is the largest difference, divided by the size of the larger motion (the range of its first
+    four numbers), or by `least` where that is larger.
     """
     one, two = np.asarray(place), np.asarray(other)
     size = np.maximum(np.ptp(one[..., :4], axis=-1), np.ptp(two[..., :4], axis=-1))
@@ -146,18 +146,19 @@ def distinct(cycles: Sequence[Cycle]) -> list[Cycle]:
 
 
 def error_of_runs(numbers: Mapping[str, Any], length: float) -> float:
-    """Largest distance of places of one cycle, relative to its size, in runs with such
-    tolerances."""
+    """Largest `distance` between places of one and the same cycle in runs with these tolerances.
+
+    numbers: rtol and atol, as in the attributes of a sweep. length: unit of length of atol."""
     atol = numbers.get("atol")
     return RUN * max(numbers["rtol"], 0.0 if atol is None else atol / length)
 
 
 @dataclass(frozen=True)
 class Runs:
-    """Places of the attractors of the runs of a sweep, and their events, in own units.
+    """Places, in own units, and signatures of the attractors that the runs of a sweep reach.
 
-    places: as `place_of`, [.., 5], with the period 0 at rest; signatures: names, [..]; error:
-    largest distance of places of one cycle, relative to its size.
+    places: as `place_of`, [.., 5], with the period 0 at rest; signatures: names, [..]; error: see
+    `error_of_runs`.
     """
 
     places: np.ndarray
@@ -182,7 +183,7 @@ class Runs:
         return Runs(self.places[index], np.asarray(self.signatures[index]), self.error)
 
     def same(self, others: "Runs") -> tuple[np.ndarray, np.ndarray]:
-        """Which pairs of runs lead to one cycle, and for which pairs this is not certain."""
+        """Masks of the pairs of runs that lead to one cycle, and of the uncertain pairs."""
         away = distance(self.places, others.places)
         fits = self.signatures == others.signatures
         same = fits & (away < self.error)

@@ -1,7 +1,7 @@
-"""Motion backwards in time, and unstable cycles that are solved for there.
+"""Motion backwards in time, and unstable cycles that are solved for in reversed time.
 
 In reversed time, t -> -t and x2 -> -x2, an oscillator is one with the signs of its damping, loads
-and velocities changed. It never sticks: orbits that do not stick continue backwards in one way.
+and velocities changed. It never sticks: orbits that do not stick continue backwards uniquely.
 
 Slow belts with steep friction laws make cycles whose multiplier is 1e20. They pass along a
 boundary, just off it, for a long time; forwards no floating-point start leads to such a cycle,
@@ -23,7 +23,7 @@ from .motions import sampled_chain
 
 
 class BackwardCycle(Cycle):
-    """An unstable cycle that was solved for backwards; its derivatives are not known.
+    """An unstable cycle that was solved for in reversed time, without derivatives.
 
     backwards_chain, backwards_unknowns: the attracting cycle of the oscillator reversed in time.
     """
@@ -40,7 +40,7 @@ class BackwardCycle(Cycle):
 
 
 def moved_in_time(osc: Oscillator, way: Array | float) -> Oscillator:
-    """The oscillator itself, way = 1, or the one reversed in time, way = -1."""
+    """The oscillator itself for way = 1, or reversed in time for way = -1."""
     return eqx.tree_at(
         lambda o: [o.damping, *(b.velocity for b in o.belts), *(b.load for b in o.belts)],
         osc,
@@ -54,14 +54,14 @@ def reversed_in_time(osc: Oscillator) -> Oscillator:
 
 
 def solved(osc: Oscillator, loop: Loop) -> Cycle:
-    """The cycle near a known loop."""
+    """The cycle near a loop of concrete arrays."""
     return exactly(osc, cut([loop])[0], jnp.asarray(np.array(Status.OK.value)))
 
 
 def forwards(osc: Oscillator, cycle: Cycle) -> BackwardCycle:
-    """The unstable cycle of an oscillator, from the attracting one of that reversed in time.
+    """The unstable cycle of an oscillator, from the attracting cycle of the reversed oscillator.
 
-    Each arc begins where it ended, and ends as the arc before it, which is now after it, ended.
+    Each arc begins at its former end, and takes the kind of end of the arc that preceded it.
     """
     chain, z = cycle.chain, np.asarray(cycle.unknowns)
     n = int(np.sum(np.asarray(chain.used)))

@@ -1,4 +1,4 @@
-"""Closed chains of arcs, and the loops of orbits that are guesses of them.
+"""Closed chains of arcs, and loops of orbits as guesses of chains.
 
 The number of arcs is padded to a few fixed sizes, and their modes and ends are data, so that one
 compiled program serves all signatures.
@@ -21,27 +21,27 @@ from ..motion.arcs import Ends
 from ..numerics.compiling import power_of_two
 from ..results import Status
 
-#: Sizes of chains: the number of arcs is rounded up to one of these; the first one under a trace.
+#: Sizes of chains: the number of arcs is rounded up to one of these; under a trace the first one.
 SIZES = (16, 32, 64)
 
 
 def first_failure(status: Array, fine: Any, code: Status) -> Array:
-    """The status, or the code of a failure in place of OK where something is not fine."""
+    """The status, in which OK is replaced by `code` where `fine` is false."""
     return jnp.where((status == Status.OK) & ~fine, code.value, status)
 
 
 def after_each(chain: "Chain | Loop", rows: Array) -> Array:
-    """Of rows of the arcs the one after each; after the last used arc comes the first."""
+    """For each arc the row of the next arc; after the last used arc comes the first."""
     last = jnp.arange(chain.ends.size) == jnp.sum(chain.used) - 1
     last = last.reshape(-1, *[1] * (rows.ndim - 1))
     return jnp.where(last, rows[0], jnp.roll(rows, -1, axis=0))
 
 
 class Chain(eqx.Module):
-    """A closed sequence of arcs: contact codes [arcs, belts], ends [arcs], and step fractions.
+    """A closed sequence of arcs: contact codes [arcs, belts], ends [arcs], mesh [arcs, steps].
 
-    ends: numbers of `arcs.Ends`. An unused arc has a duration of zero.
-    """
+    ends: numbers of `arcs.Ends`; mesh: integration steps as fractions of the arc's duration. An
+    unused arc has a duration of zero."""
 
     codes: Array
     ends: Array
@@ -62,12 +62,12 @@ class Chain(eqx.Module):
         return replace(self, mesh=jnp.repeat(self.mesh / 2, 2, axis=-1))
 
     def loop(self, z: Array) -> "Loop":
-        """The loop with these unknowns, [arcs, parts of the state and 1]."""
+        """The loop with the unknowns z: entry state and duration of each arc, [arcs, d + 1]."""
         return Loop(self.codes, self.ends, z[:, :-1], z[:, -1])
 
     def on_both_meshes(self, value: Callable[[Any], Any]) -> Any:
-        """value(chain) with its integration steps as they are, and with all of them halved."""
-        # Padded by steps of length zero to one shape.
+        """value(chain) for the mesh as it is, and with all steps halved, stacked: [2, ..]."""
+        # The first mesh is padded by steps of length zero to the shape of the second.
         as_it_is = jnp.concatenate([self.mesh, jnp.zeros_like(self.mesh)], axis=1)
         meshes = jnp.stack([as_it_is, self.halved.mesh])
         return lax.map(lambda mesh: value(replace(self, mesh=mesh)), meshes)
@@ -76,7 +76,7 @@ class Chain(eqx.Module):
 class Loop(eqx.Module):
     """One loop of an orbit, arc by arc, padded.
 
-    Codes and ends of a `Chain`, and a guess of its unknowns, the entry states and durations.
+    Codes and ends as in a `Chain`, and a guess of its unknowns: entry states and durations.
     """
 
     codes: Array
@@ -95,7 +95,7 @@ class Loop(eqx.Module):
 
 
 def blank_loop(size: int, belts: int) -> Loop:
-    """A loop without arcs, for its shapes."""
+    """A loop of unused arcs, for code that needs its shapes."""
     unused = np.full(size, Ends(belts).unused)
     arrays = np.ones((size, belts)), unused, np.zeros((size, 2)), np.zeros(size)
     return Loop(*map(jnp.asarray, arrays))
@@ -104,7 +104,7 @@ def blank_loop(size: int, belts: int) -> Loop:
 def padded_loop(
     codes: np.ndarray, ends: np.ndarray, entries: np.ndarray, durations: np.ndarray
 ) -> Loop:
-    """Known arcs as a loop, padded to one of `SIZES`, or to a power of two."""
+    """NumPy arcs as a loop, padded to one of `SIZES`, or to a power of two above these."""
     count = len(ends)
     size = next((one for one in SIZES if one >= count), power_of_two(count, SIZES[-1]))
     more = size - count
@@ -118,7 +118,7 @@ def padded_loop(
 
 
 def modes_of(loop: Chain | Loop) -> np.ndarray:
-    """Contact codes of the arcs of one loop, [arcs, belts], without those that are unused."""
+    """Contact codes of the used arcs of one loop, [arcs, belts]."""
     codes, ends = np.asarray(loop.codes), np.asarray(loop.ends)
     return codes[ends != Ends(codes.shape[-1]).unused].astype(int)
 
@@ -134,12 +134,12 @@ def following_codes(chain: Chain | Loop) -> Array:
 
 
 def room_of(arcs: int) -> int:
-    """The size of a chain for this number of arcs, SIZES[-1] at most."""
+    """The smallest size of a chain that holds this number of arcs, which is at most SIZES[-1]."""
     return next(size for size in SIZES if size >= arcs)
 
 
 def cut(loops: Sequence[Loop], *, more: int = 0) -> list[Loop]:
-    """Known loops with no more room than the longest of them needs, and `more` rows."""
+    """Concrete loops cut to the size that the longest of them needs with `more` spare rows."""
     unused = Ends(loops[0].codes.shape[-1]).unused
     longest = max(int(np.sum(np.asarray(loop.ends) != unused)) for loop in loops)
     room = slice(room_of(min(longest + more, SIZES[-1])))

@@ -1,17 +1,17 @@
 """Shooting with a clock: a chain of arcs that is closed after n periods of the forcing.
 
-As in `shooting`, but a state is (x1, x2, t), and a chain begins at the phase 0 of the forcing and
-is cut wherever a period ends, at which t begins at 0 again. Where an event is near the phase 0 it
-begins at another share s of a period P instead, and t at s P. For N arcs:
+As in `shooting`, but a state is (x1, x2, t). A chain begins at the phase 0 of the forcing and is
+cut wherever a period ends, where t restarts at 0. Where an event is near the phase 0 the chain
+begins at another fraction s of the period P instead, with t = s P. For N arcs:
 
     4N unknowns    entry state (x1, x2, t) and duration T of every arc
      N equations   the guard of the arc's end vanishes at its end; at the end of a period
                    t - (1 + s) P
     3N equations   the end of an arc is the entry of the next, after the last comes the first
 
-The derivative of the end of an arc by its entry, at the time at which its guard vanishes, holds
-what saltation matrices do: a chain's product of these is the monodromy matrix, [2, 2]. Behind a
-stick phase it has rank one, for what a motion remembers of its start is one number, the time.
+The derivative of the end of an arc by its entry, at the time at which its guard vanishes, contains
+the saltation matrix: the product of these along a chain gives the monodromy matrix, [2, 2]. Behind
+a stick phase it has rank one: the time is all that a motion remembers of its start.
 """
 
 import functools
@@ -70,32 +70,32 @@ from .shooting import (
     with_columns,
 )
 
-#: A step times the density of steps that is wanted there: of order twelve, so that what a step
-#: leaves is rounding.
+#: Length of an integration step times the density of steps: at order twelve its error is then no
+#: larger than rounding.
 TIMED_STRIDE = 0.25
-#: The smallest mesh of an arc; steps by which steps are placed, for each that an arc may have.
+#: The smallest mesh of an arc; coarse steps that sample the density, for each step of the mesh.
 LEAST_STEPS, PLACING = 8 * ARC_STEPS, 2
-#: A boundary or limit that is passed by less is touched.
+#: A boundary or stick limit that is exceeded by less than this is only touched.
 TOUCHES_AGAIN = 1e-8
-#: A guard that rises faster where an arc ends has been zero before.
+#: A guard that rises faster than this where it ends an arc has been zero before.
 COMES_BACK = 1e-6
-#: Newton steps from where a quintic has an extremum to where the motion has it.
+#: Newton steps from the extremum of an interpolating quintic to that of the motion.
 EXTREMUM_STEPS = 2
 
 
 class TimedChain(Chain):
-    """A chain of whole periods; turns: `common_turns` of all that knows the time;
-    share: where in a period it begins, in [0, 1); None: at the phase 0."""
+    """A chain of whole periods. turns: `common_turns` of the oscillator's frequencies;
+    share: fraction of a period at which it begins, in [0, 1); None: at the phase 0."""
 
     turns: int = eqx.field(static=True, kw_only=True)
     share: Array | None = eqx.field(default=None, kw_only=True)
 
 
 def turns_of(osc: Oscillator) -> int:
-    """`common_turns` of a known oscillator; `ValueError` where there is no common period.
+    """`common_turns` of a concrete oscillator; `ValueError` where there is no common period.
 
-    A frequency 0 is that of a user's force, or one by which derivatives are taken: none there, as a
-    force that is known to be constant is no wave.
+    A frequency 0 has no period here: a force declared constant is no wave, so it is the frequency
+    of a user's force, or one by which derivatives are taken.
     """
     found = [float(one) for one in lax.stop_gradient(frequencies(osc))]
     rates = [np.float64(one or np.nan) for one in found]
@@ -107,7 +107,7 @@ def turns_of(osc: Oscillator) -> int:
 
 
 def forcing_period(osc: Oscillator, turns: int) -> Array:
-    """The period of all that knows the time."""
+    """The common period of all forces and belt velocities that depend on time."""
     return 2 * jnp.pi * turns / clock_frequency(osc)
 
 
@@ -115,14 +115,14 @@ def forcing_period(osc: Oscillator, turns: int) -> Array:
 
 
 def least_steps(osc: Oscillator, loop: Loop) -> int:
-    """The size of a mesh that the arcs of a known loop need; see `timed_mesh`."""
+    """The size of the mesh that the arcs of a concrete loop need; see `timed_mesh`."""
     counts = _counted_ends(lax.stop_gradient(osc), loop.codes, loop.entries, loop.durations)
     return power_of_two(math.ceil(min(float(jnp.max(counts)), 4096.0)) + 1, LEAST_STEPS)
 
 
 @jit
 def _counted_ends(osc: Oscillator, codes: Array, entries: Array, durations: Array) -> Array:
-    """The numbers of steps that arcs need, by the mean density of steps along them."""
+    """Numbers of steps that the arcs need, [N], by the mean density of steps along them."""
 
     def one(osc, codes, y, duration):
         def advance(y, _):
@@ -166,7 +166,7 @@ _compiled_chain = jit(timed_chain)
 def timed_chain_of(
     osc: Oscillator, loop: Loop, turns: int, share: Array | None = None
 ) -> tuple[TimedChain, Array]:
-    """`timed_chain` of a known loop, with as many steps as its arcs need."""
+    """`timed_chain` of a concrete loop, with as many steps as its arcs need."""
     return _compiled_chain(osc, loop, least_steps(osc, loop), turns, share)
 
 
@@ -194,7 +194,7 @@ def _timed_arc_equations(
 
 
 def _and_columns(turns: int, osc, along, share, codes, end, mesh, unknown: Array):
-    """`_timed_arc_equations` and their derivatives, by the unknowns and along, [4, 4 + k]."""
+    """`_timed_arc_equations`, and derivatives by unknowns and k directions `along`, [4, 4 + k]."""
 
     def equations(osc, u):
         return _timed_arc_equations(turns, osc, share, codes, end, mesh, u)
@@ -203,7 +203,7 @@ def _and_columns(turns: int, osc, along, share, codes, end, mesh, unknown: Array
 
 
 def _by_turns(function: Callable) -> Callable[[int], Callable]:
-    """A function of an arc's row whose first argument is the static number of turns, arc by arc."""
+    """`arc_by_arc` of a function whose first argument is static: the number of turns."""
 
     @functools.cache
     def of_turns(turns: int) -> Callable:
@@ -257,7 +257,7 @@ class TimedClosed(Equations):
 
 
 def _arc_map(turns, osc, share, codes, end, mesh, unknown: Array) -> Array:
-    """How the state in which the next arc begins moves with that in which this one does, [3, 3]."""
+    """Derivative of the entry state of the next arc by the entry state of this arc, [3, 3]."""
     _, blocks = _and_columns(turns, osc, None, share, codes, end, mesh, unknown)
     by_entry, by_time = blocks[:, :3], blocks[:, 3]
     return by_entry[:3] - jnp.outer(by_time[:3], by_entry[3] / by_time[3])
@@ -268,7 +268,7 @@ _arc_maps = _by_turns(_arc_map)
 
 @_by_turns
 def _maps_and_slopes(turns, osc, along, share, codes, end, mesh, unknown: Array):
-    """`_arc_map` and its derivatives by the unknowns and along directions, [3, 3, 4 + k]."""
+    """`_arc_map`, and its derivatives by unknowns and k directions `along`, [3, 3, 4 + k]."""
 
     def arc_map(osc, u):
         return _arc_map(turns, osc, share, codes, end, mesh, u)
@@ -282,12 +282,12 @@ def arc_maps(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
 
 
 def logs_of_areas(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
-    """The logarithms of the factors by which arcs change areas of states, with the saltation at
-    their ends, [N]; not of stick arcs, behind which nothing is left of an area.
+    """Logarithms of the factors by which arcs, with the saltation at their ends, change areas of
+    states, [N]; they hold for slip arcs only: behind a stick arc no area is left.
 
     By the divergence of the field (Liouville's formula), so they are exact where the products of
     `arc_maps` have lost the smaller one of two directions in rounding. At a boundary an area
-    changes by the ratio of the rates at which that is passed behind and before.
+    changes by a ratio: the rate at which the boundary is crossed, after over before.
     """
 
     def one(osc, codes, end, mesh, after, unknown):
@@ -356,7 +356,7 @@ def monodromy_and_slopes(
 
 
 def multipliers_of(matrix: Array, sticks: Array) -> Array:
-    """The eigenvalues of a monodromy matrix, complex, [2], the larger one first; of a motion that
+    """The eigenvalues of a monodromy matrix, complex, [2], the larger one first. Where the motion
     sticks the second is exactly 0, and the first the trace."""
     trace = matrix[0, 0] + matrix[1, 1]
     det = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
@@ -377,13 +377,13 @@ def multipliers_of(matrix: Array, sticks: Array) -> Array:
 
 
 def states_at_phase(osc: Oscillator, chain: TimedChain, z: Array, phase: Array) -> Array:
-    """The states (x1, x2) of all arcs at a phase, a share of a period, [N, 2]; NaN of those that do
-    not pass it, so that there is one for each period."""
+    """States (x1, x2) of all arcs at a phase, a fraction of a period, [N, 2]; NaN for arcs that do
+    not pass it, so that one row per period is finite."""
     begins = 0.0 if chain.share is None else chain.share
     t = forcing_period(osc, chain.turns) * jnp.where(phase < begins, phase + 1, phase)
 
     def one(osc, t, codes, is_first, is_last, mesh, unknown, following):
-        # Where a period begins t is known up to rounding.
+        # Where a period begins t is exact only up to rounding, so it is not compared there.
         passes = (is_first | (unknown[2] <= t)) & (is_last | (following > t))
         since = jnp.where(passes, t - unknown[2], 0.0)
         state = flow(osc, codes, mesh, unknown[:3], since)[:2]
@@ -411,8 +411,8 @@ def _after(osc: Oscillator, codes: Array, y: Array, h: Array) -> Array:
 
 @jit
 def guards_along(osc: Oscillator, chain: TimedChain, z: Array) -> tuple[Array, Array, Array]:
-    """Of all arcs the states at the ends of steps, [N, steps + 1, 3], and the guards of their modes
-    there and how fast these change, [N, steps + 1, guards]."""
+    """States of all arcs at the ends of steps, [N, steps + 1, 3], and there the guards of the arcs'
+    modes and their time derivatives, [N, steps + 1, guards] each."""
 
     def one(osc, codes, mesh, unknown):
         mode = mode_of(codes)
@@ -435,8 +435,8 @@ def guards_along(osc: Oscillator, chain: TimedChain, z: Array) -> tuple[Array, A
 
 
 class Least(NamedTuple):
-    """Of functions along an arc the least values; of the steps in which they are the states before,
-    [functions, 3], the lengths, and where in them, as fractions."""
+    """Least values of functions along an arc, and for the step in which each occurs: the state
+    before it, [functions, 3], its length, and the place in it as a fraction, [functions]."""
 
     value: Array
     before: Array
@@ -452,9 +452,9 @@ def _least_along(
     duration: Array,
     function: Callable[[Oscillator, TimedState], Array],
 ) -> Least:
-    """The least values of functions of a known oscillator and of the state along an arc.
+    """The least values along an arc of functions of the oscillator and the state.
 
-    The states before steps are differentiable.
+    Only the states before steps, and the steps' lengths, are differentiable.
     """
     mode, known = mode_of(codes), lax.stop_gradient(osc)
 
@@ -489,9 +489,9 @@ def _least_along(
 
 
 def _least_between(before: Trend, after: Trend, h: Array) -> tuple[Array, Array]:
-    """The least values in a step between two trends of functions, and where, as its fractions.
+    """Least values of functions in a step of length h, and their places as fractions of the step.
 
-    There a function is the quintic with its values, slopes and curvatures at both ends.
+    Each function is the quintic with the values, slopes and curvatures of `before` and `after`.
     """
     start, end = ((one.value, one.slope * h, one.curvature * h**2) for one in (before, after))
     between = quintic(start, end)
@@ -507,7 +507,7 @@ def _least_between(before: Trend, after: Trend, h: Array) -> tuple[Array, Array]
 
 
 def least_guard(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array) -> Array:
-    """The least value that a guard of its mode has along an arc, up to rounding."""
+    """The least value of all guards of an arc's mode along the arc, up to rounding."""
 
     def guards(osc, y):
         return guards_at(osc, mode_of(codes), y)
@@ -515,12 +515,12 @@ def least_guard(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: 
     return jnp.min(_least_along(osc, codes, mesh, y, duration, guards).value)
 
 
-#: What is least where x1, and x2, is smallest or largest.
+#: Weights of (x1, x2) whose sums are least at the smallest and largest x1, and x2.
 _SIDES = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
 
 def extrema_along(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
-    """The smallest and the largest x1, and those of x2, of a solution of the equations, [4].
+    """The smallest and the largest x1, then x2, along a solution of the equations, [4].
 
     Differentiable by the oscillator and the unknowns, twice.
     """
@@ -540,7 +540,7 @@ def extrema_along(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
 def _polished_least(
     osc: Oscillator, codes: Array, weight: Array | np.ndarray, before: Array, h: Array, s: Array
 ) -> Array:
-    """The least value of weight (x1, x2) near a fraction of a step of length h."""
+    """The least value of weight . (x1, x2) near the fraction s of a step of length h."""
     mode = mode_of(codes)
 
     def state(s):
@@ -555,13 +555,13 @@ def _polished_least(
         found = trend_of(osc, mode, function, (y[0], y[1], y[2]))
         bends = (found.curvature > 0) & (h > 0)
         new = s + step_to_root(found.slope, found.curvature * h, where=bends)
-        # At the end of an arc a coordinate may have a kink, and be extreme for that.
+        # At the end of an arc a coordinate may have a kink, and its extremum there.
         s = jnp.where(bends & (s > 0) & (s < 1) & (new > 0) & (new < 1), new, s)
     return function(state(s))
 
 
 def guard_slope(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
-    """How fast the guard that ends an arc rises there; 0 of arcs that end otherwise."""
+    """Time derivative of the guard that ends an arc, at y; 0 for arcs that end otherwise."""
     mode, names = mode_of(codes), Ends(len(osc.belts))
     at = guards_trend(osc, mode, y)
     count = at.value.size - 2
@@ -573,8 +573,8 @@ def guard_slope(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
 
 def timed_admissible(osc: Oscillator, chain: TimedChain, z: Array) -> Array:
     """Whether the oscillator moves along a solution of the equations: no arc leaves its mode before
-    its end, or comes back to it there, none crosses a boundary where the mass would stick, and
-    each stick phase begins on its belt, also where a period begins in one."""
+    its end, or re-enters it there, none crosses a boundary where the mass would stick, and x2 is
+    the belt's velocity where a stick phase begins, or where a period begins within one."""
     n = len(osc.belts)
 
     def one(osc, codes, mesh, end, after, unknown):

@@ -1,4 +1,4 @@
-"""What a solution of the shooting equations is: its error, its multiplier, and whether the
+"""Properties of a solution of the shooting equations: its error, its multiplier, and whether the
 oscillator moves along it."""
 
 import equinox as eqx
@@ -34,7 +34,7 @@ from .shooting import (
     with_columns,
 )
 
-#: An arc of a shorter duration may have none: it is the square root of rounding.
+#: An arc that lasts less than this, the square root of rounding, may have the duration zero.
 LASTS = 1e-6
 
 
@@ -42,10 +42,10 @@ LASTS = 1e-6
 def closure(osc: Oscillator, chain: Chain, z: Array) -> tuple[Array, Array]:
     """The largest error in the shooting equations, and the determinant of the monodromy matrix.
 
-    The latter with stick phases left out: exp of the mean divergence, and at each crossing of a
-    boundary the determinant of its saltation matrix, x2' after over before. One multiplier of a
-    planar cycle is 1, so this is the other one. Contact edges have determinant one: their saltation
-    matrix is [[1, 0], [jump of x2' / x2, 1]].
+    The determinant leaves stick phases out. It is exp of the integral of the divergence, times the
+    determinant of the saltation matrix, x2' after over before, at each crossing of a boundary. One
+    multiplier of a planar cycle is 1, so the determinant is the other one. Contact edges have
+    determinant one: their saltation matrix is [[1, 0], [jump of x2' / x2, 1]].
     """
     entries = jnp.roll(z[:, :2], -1, axis=0)
     columns = arc_columns(chain, following_codes(chain), z, entries)
@@ -55,7 +55,7 @@ def closure(osc: Oscillator, chain: Chain, z: Array) -> tuple[Array, Array]:
 
 @closure.def_jvp
 def _(primals, tangents):
-    # By columns, as in `_by_columns`; the error has no derivative.
+    # By columns, as in `shooting._by_columns`; the error has no derivative.
     osc, chain, z = primals
     along, weights = directions_of(osc, tangents[0])
     _, by_z, by_osc = multiplier_and_slopes(osc, along, chain, z)
@@ -83,7 +83,7 @@ _errors_and_factors = arc_by_arc(_error_and_factor)
 
 
 def _error_and_factor_of(osc: Oscillator, codes, end, mesh, following, unknown, entry):
-    """`_error_and_factor` of an arc that is used."""
+    """`_error_and_factor` of a used arc."""
     back = magnifies(osc, codes, unknown[:2], entry)
     start, target = select(back, (entry, unknown[:2]), (unknown[:2], entry))
     way = jnp.where(back, -1.0, 1.0)
@@ -94,7 +94,7 @@ def _error_and_factor_of(osc: Oscillator, codes, end, mesh, following, unknown, 
     before_crossing = mode_acceleration(osc, mode_of(codes), last[0], last[1])
     after_crossing = mode_acceleration(osc, mode_of(following), entry[0], entry[1])
     slips = jnp.all(codes != 0) & (unknown[2] != 0)
-    # The boundary of a belt at rest is passed in an extremum of x1.
+    # The boundary of a belt at rest, x2 = 0, is crossed at an extremum of x1.
     flips = (end == Ends(len(osc.belts)).extremum_x1) & jnp.any(codes * following == -1)
     crosses = ((end < len(osc.belts)) | flips) & jnp.all(following != 0)
     ratio = after_crossing / jnp.where(crosses, before_crossing, 1.0)
@@ -106,10 +106,10 @@ def _error_and_factor_of(osc: Oscillator, codes, end, mesh, following, unknown, 
 def multiplier_and_slopes(
     osc: Oscillator, along: Oscillator, chain: Chain, z: Array
 ) -> tuple[Array, Array, Array]:
-    """The determinant of `closure`, and its derivatives, [N, 3] and [k].
+    """The determinant of `closure`, and its derivatives by z, [N, 3], and along k directions, [k].
 
-    With respect to z, and along the k directions `along`, as for `residual_and_blocks`. Arc by arc:
-    reverse mode through all of them takes three times as long to compile.
+    along: the directions, as for `residual_and_blocks`. The derivatives are taken arc by arc:
+    reverse mode through all arcs takes three times as long to compile.
     """
     entries = jnp.roll(z[:, :2], -1, axis=0)
     columns = arc_columns(chain, following_codes(chain), z, entries)
@@ -132,8 +132,8 @@ def _products_of_others(factors: Array) -> Array:
 def _factors_and_slopes(
     osc: Oscillator, along: Oscillator, codes, end, mesh, following, unknown: Array, entry: Array
 ):
-    """The factor of an arc and its derivatives, [5 + k]: by its unknowns, the next entry, the
-    directions."""
+    """The factor of an arc, and its derivatives by its unknowns, by the next arc's entry, and along
+    the directions, [5 + k]."""
 
     def factor(osc, both):
         return _error_and_factor(osc, codes, end, mesh, following, both[:3], both[3:])[1]
@@ -146,8 +146,8 @@ def admissible(osc: Oscillator, chain: Chain, z: Array) -> Array:
 
     Every arc has a duration >= 0 and stays inside its mode: both ends are examined; between them
     x1, x2 and the needed force are monotone, and no extremum of x1 is passed unmarked. All belts to
-    which the mass sticks have its velocity. None crosses a boundary, or leaves one beyond an edge,
-    where the mass would stick.
+    which the mass sticks have its velocity. No arc crosses a boundary, or leaves one beyond an
+    edge, where the mass would stick.
     """
     belts = range(len(osc.belts))
 
@@ -160,10 +160,10 @@ def admissible(osc: Oscillator, chain: Chain, z: Array) -> Array:
             holds = ~mode.any_stuck | (jnp.abs(needed) <= capacity(osc, mode) + HOLDS)
             together = jnp.where(codes == 0, jnp.abs(velocities - osc.omega * y[1]), 0.0)
             fine = fine & jnp.all(inside >= -HOLDS) & holds & jnp.all(together <= HOLDS)
-        # An arc along which x2 changes its sign passes an extremum of x1 that is no end of an arc.
+        # An arc along which x2 changes sign passes an extremum of x1 that ends no arc.
         lowest, highest = jnp.minimum(unknown[1], exit_[1]), jnp.maximum(unknown[1], exit_[1])
         fine = fine & ((lowest >= -HOLDS) | (highest <= HOLDS))
-        # At the point of a corner the arc behind the edge has no duration.
+        # At a corner, where a boundary meets an edge, the arc behind the edge has duration zero.
         on_boundary = jnp.abs(velocities - osc.omega * exit_[1]) <= HOLDS
         goes_on = on_boundary & (jnp.abs(after) == 1) & lasts
         hit = [(end == belt) | goes_on[belt] for belt in belts]
@@ -180,8 +180,8 @@ def admissible(osc: Oscillator, chain: Chain, z: Array) -> Array:
 
 
 def passes_extremum(osc: Oscillator, chain: Chain, z: Array) -> Array:
-    """Whether an arc of a solution that slips passes an extremum of x2, where none ends: along it
-    x2' changes its sign."""
+    """Whether x2' changes sign along a slip arc of a solution: the arc passes an extremum of x2,
+    where it should have ended."""
 
     def one(codes, entry, exit_):
         mode = mode_of(codes)

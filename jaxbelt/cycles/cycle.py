@@ -48,11 +48,11 @@ if TYPE_CHECKING:
 #: Integration steps per slip arc where ARC_STEPS leave a larger error in the equations than EXACT,
 #: as estimated by halving the steps.
 FINE_STEPS, EXACT = 32, 1e-11
-#: Numbers of steps after these, for known oscillators: for long arcs that creep along a strongly
-#: damped oscillator's slow direction.
+#: Numbers of steps tried after FINE_STEPS, outside of traces: for long arcs that creep along a
+#: strongly damped oscillator's slow direction.
 FINER_STEPS = (128, 512)
-#: A solution with a smaller relative error is a cycle: on the way to an equilibrium, which is a
-#: double root, each Newton step is half of what is left.
+#: A solution whose error is a smaller fraction of its size is a cycle: on the way to an
+#: equilibrium, which is a double root, each Newton step only halves the remaining distance.
 DISTINCT = 1e-2
 #: Speeds that differ by less than this part of them count as equal.
 SAME_SPEED = 1e-9
@@ -159,8 +159,7 @@ class Cycle(ClosedMotion):
 
 
 def cycle_of_zeros(osc: Oscillator) -> Cycle:
-    """An object with the shapes of a cycle of that oscillator, on which functions of cycles are
-    tried."""
+    """A cycle of zeros with the shapes for that oscillator, to try functions of cycles on."""
     arcs, number, whole = SIZES[0], jnp.zeros(()), jnp.zeros((), int)
     codes, mesh = jnp.zeros((arcs, len(osc.belts))), jnp.zeros((arcs, FINE_STEPS))
     chain = Chain(codes, jnp.zeros(arcs, int), mesh)
@@ -187,9 +186,9 @@ def cycle_of(
 ) -> tuple[Cycle, Array]:
     """The `Cycle` of a solution z, and its multiplier with stick phases left out.
 
-    Where z is no cycle, its numbers are NaN and it has a status. error: the largest in its
-    equations, where these differ from those of the chain and are known to hold: an arc that was
-    solved for backwards may magnify errors a hundred thousand times when it is followed forwards.
+    Where z is no cycle, the numbers are NaN and the status says why. error: the largest error of
+    other equations that z is known to solve, in place of the chain's: an arc that was solved for
+    backwards may magnify errors a hundred thousand times when it is followed forwards.
     """
     residual, slope = closure(osc, chain, z)
     if error is None:
@@ -217,7 +216,7 @@ def cycle_of(
 
 @jit
 def _loop_reached(osc: Oscillator, y0: Array, size: int) -> tuple[Loop, Array, Array, Array]:
-    """The loop that the start leads to, in `size` arcs.
+    """The loop that the start leads to, padded to `size` arcs.
 
     Also returns its number of arcs, a status, and the state at the end of the orbit.
     """
@@ -260,10 +259,10 @@ def exactly(osc: Oscillator, loop: Loop, status: Array) -> Cycle:
             break
         if int(cycle.status) == Status.NO_CONVERGENCE:
             change = float(_mesh_error(osc, loop, coarser))
-            # With the order two that is left across a kink.
+            # Across a kink the order drops to two: the estimate with the most steps.
             finest = change * (coarser / FINER_STEPS[-1]) ** 2
             if change < EXACT or (finest > HOLDS and _slips_across_change(osc, loop)):
-                break  # not because of its steps, or more of them do not help
+                break  # the steps are not the cause, or more of them do not help
         coarser = steps
         finer, remaining = _polished(osc, loop, status, steps)
         if int(cycle.status) == Status.OK and remaining > 0.1 * error:
@@ -273,9 +272,9 @@ def exactly(osc: Oscillator, loop: Loop, status: Array) -> Cycle:
 
 
 def _slips_across_change(osc: Oscillator, loop: Loop) -> bool:
-    """Whether the mass slips, on a known loop, at the speed of the largest jump or kink of a law.
+    """Whether the slip speed passes the largest jump or kink of a law along a concrete loop.
 
-    That is of a user's law.
+    Only a user's law has one.
     """
     slips = _slip_speeds(osc, modes_of(loop), np.asarray(loop.entries)[:, 1])
     for belt, speeds in zip(osc.belts, slips, strict=True):
@@ -289,9 +288,9 @@ def _slips_across_change(osc: Oscillator, loop: Loop) -> bool:
 
 
 def _slip_speeds(osc: Oscillator, modes: np.ndarray, x2: np.ndarray) -> list[np.ndarray]:
-    """For each belt the speeds at both ends of the arcs of a known loop that slip on it, [2, arcs].
+    """For each belt the slip speeds at both ends of the arcs that slip on it, [2, arcs].
 
-    Between these an arc's speed rises or falls throughout.
+    The loop is concrete. Between its ends an arc's speed is monotone.
     """
     begin = x2[: len(modes)]
     ends = np.stack([begin, np.roll(begin, -1)])
@@ -302,7 +301,7 @@ def _slip_speeds(osc: Oscillator, modes: np.ndarray, x2: np.ndarray) -> list[np.
 
 
 def warn_of_extrapolation(cycles: Iterable[Cycle], depth: int = 4) -> None:
-    """Warns where known cycles slip faster than the measured range of a belt's friction.
+    """Warns where concrete cycles slip faster than the measured range of a belt's friction.
 
     depth: the `stacklevel` of the caller of the public function.
     """
@@ -314,7 +313,7 @@ def warn_of_extrapolation(cycles: Iterable[Cycle], depth: int = 4) -> None:
 def warn_of_fast_loops(
     loops: Iterable[tuple[Oscillator, Chain | Loop, np.ndarray]], depth: int
 ) -> None:
-    """The same for loops of oscillators, with x2 at the entry of each arc, [arcs]."""
+    """`warn_of_extrapolation` for loops of oscillators, with x2 at the entry of each arc."""
     worst, belt = 1.0, 0
     for osc, loop, x2 in loops:
         ends = [float(np.asarray(one.friction.measured_to)) for one in osc.belts]
@@ -339,7 +338,7 @@ def _is_inexact(cycle: Cycle, error: Array) -> Array:
 
 @jit
 def _mesh_error(osc: Oscillator, loop: Loop, steps: int) -> Array:
-    """Largest change of the equations of a loop, as it is, with halved steps."""
+    """Largest change of the residual of a loop, not yet solved, when its steps are halved."""
     chain, z = meshed(osc, loop, steps)
     values = (residual(osc, one, z)[0] for one in (chain, chain.halved))
     return jnp.max(jnp.abs(jnp.subtract(*values)))
@@ -362,7 +361,7 @@ def _solved_in_lanes(osc: Oscillator, loop: Loop, status: Array) -> tuple[Array,
     inexact = _is_inexact(coarse, error) & (status == Status.OK)
 
     def fine():
-        # Lanes that do not need it are not solved.
+        # Lanes that are exact enough get a failed status here, so they are not solved again.
         own_status = jnp.where(inexact, status, Status.NO_CONVERGENCE.value)
         finer = polish(osc, loop, own_status, FINE_STEPS)
         return select(inexact, (finer.chain.mesh, *_solution_of(finer)), found)
@@ -378,8 +377,8 @@ def _solution_of(cycle: Cycle) -> tuple[Array, Array, Array]:
 def _polished(osc: Oscillator, loop: Loop, status: Array, steps: int) -> tuple[Cycle, Array]:
     """The cycle near a loop, and the error in its equations with halved steps."""
     chain, guess = meshed(lax.stop_gradient(osc), loop, steps)
-    # Where there is no loop nothing is solved for: a step that is not finite is the last one, and
-    # the other lanes of a batch need not wait.
+    # A lane without a loop starts from NaN: a step that is not finite is the last one, so the other
+    # lanes of a batch need not wait.
     guess = jnp.where(status == Status.OK, guess, jnp.nan)
     z, iterations, off = solve_closed(osc, chain, guess)
     error, _ = closure(*lax.stop_gradient((osc, chain.halved, z)))
@@ -390,11 +389,11 @@ def _polished(osc: Oscillator, loop: Loop, status: Array, steps: int) -> tuple[C
 
 
 def polish(osc: Oscillator, loop: Loop, status: Array, steps: int = ARC_STEPS) -> Cycle:
-    """The cycle near a loop, by Newton's method; one program for all callers."""
+    """The cycle near a loop, by Newton's method; all callers share one compiled program."""
     return _polished(osc, loop, status, steps)[0]
 
 
-#: How often an orbit is followed on for MOST_ARCS where it has not repeated: with the multiplier
+#: How often an orbit that has not repeated is followed for MOST_ARCS more: with the multiplier
 #: 0.99, in loops of eight arcs, it has then come within 1e-7 of its cycle.
 MORE_BUDGETS = 15
 

@@ -1,11 +1,11 @@
 """Lyapunov exponents of forced oscillators: `lyapunov` and what it returns, `Exponents`.
 
-The orbit is followed period by period, and the derivative of the state at the end of each period by
-that at its beginning is the product of the maps of its arcs, see `clocked`, in which saltation is
-contained. A tangent is carried along, and the first exponent is the mean logarithm of its growth;
-both together are that of areas, which follows from the divergence of the field and is not lost in
+The orbit is followed period by period. The derivative of the state at the end of a period by that
+at its beginning is the product of the maps of its arcs, which include saltation, see `clocked`. A
+tangent is carried along, and the first exponent is the mean logarithm of its growth. The sum of
+both exponents is that of areas, which follows from the divergence of the field and is not lost in
 rounding where one direction shrinks much faster than the other. Behind a stick phase the maps have
-rank one: then the second exponent is -inf, which follows from the kind of arcs, too.
+rank one: the second exponent is set to -inf wherever a stick arc occurs.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -39,9 +39,9 @@ from .followed import Followed, after_period, arcs_over
 if TYPE_CHECKING:
     import pandas
 
-#: Blocks of periods whose means tell the standard errors.
+#: Number of blocks of periods; the scatter of their means gives the standard errors.
 BLOCKS = 25
-#: What steps of integration leave in an exponent, per period, where all periods are alike.
+#: Error of an exponent per period that integration steps leave where all periods are alike.
 LEAST_STANDARD_ERROR = 1e-12
 
 
@@ -49,11 +49,11 @@ class Exponents(eqx.Module):
     """Lyapunov exponents of a motion of a forced oscillator, the larger one first.
 
     Attributes:
-        exponents: Per unit of time, [2]; -inf where tangents vanish, as the second one does of a
+        exponents: Per unit of time, [2]; -inf where tangents vanish, as the second exponent of a
             motion that sticks.
-        per_period: The same per period of the forcing, [2].
-        standard_errors: Of `exponents`, from the means of blocks of periods, [2]; 0 of -inf.
-        periods: Periods that were averaged.
+        per_period: Exponents per period of the forcing, [2].
+        standard_errors: Of `exponents`, from the means of blocks of periods, [2]; 0 for -inf.
+        periods: Number of periods averaged over.
         sticks: Whether the mass sticks.
         end: State at the end, at the phase 0, [2].
         status: A `Status` code; where it is not OK every number is NaN.
@@ -104,21 +104,21 @@ def lyapunov(
     transient: int = 200,
     key: Any = None,
 ) -> Exponents:
-    """Lyapunov exponents of the motion that a start leads to, of a forced oscillator.
+    """Lyapunov exponents of the motion of a forced oscillator that a start leads to.
 
     Args:
         osc: An `Oscillator` with forcing.
         y0: Start (x1, x2) at the phase 0, that is, at t = 0, shape [2].
-        periods: Periods of the forcing that are averaged.
-        transient: Periods before these that are not.
+        periods: Number of periods of the forcing to average over.
+        transient: Number of periods before these that are skipped.
         key: A key of `jax.random` for the first tangent; None: always the same one.
 
     Returns:
         Both exponents with standard errors. A motion that stays bounded, and has settled, is
         chaotic if the first one is more than three standard errors above zero, attracts
-        quasi-periodically if it is zero within them, and is periodic if it is that far below: then
-        it is `log(abs(multiplier))` over the period. An orbit that leaves an unstable motion, or
-        grows without bounds, has one above zero, too.
+        quasi-periodically if it is zero within three, and is periodic if it is more than three
+        below: then it is `log(abs(multiplier))` over the period. An orbit that leaves an unstable
+        motion, or grows without bounds, has a first exponent above zero, too.
 
     Raises:
         ValueError: If an argument is impossible, or if the frequencies have no common period.
@@ -169,8 +169,8 @@ def _first_tangent(key: Any) -> np.ndarray:
 def _followed_tangent(
     osc: Oscillator, followed: Followed, turns: int, tangent: np.ndarray, used: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The tangent at the end of an orbit, of size one, and the logarithms of how much it grew in
-    the last periods of it, and a second one in an area with it, [used, 2]."""
+    """The tangent at the end of an orbit, of length one, and for each of the last `used` periods
+    the logarithms of its growth and of the growth of areas over it, [used, 2]."""
     loop = followed.loop()
     found = _maps(osc, loop, least_steps(osc, loop), turns)
     maps, areas = (np.asarray(one)[: len(followed.ends)] for one in found)

@@ -13,14 +13,14 @@ from ..motion.simulate import simulate
 from .chains import Loop, padded_loop
 from .clocked import forcing_period
 
-#: Periods that are followed in one run, which are the most that a motion may have.
+#: Number of periods followed in one run, and the largest number that a motion may have.
 PERIODS_AT_ONCE = 32
 
 
 class Followed(NamedTuple):
     """An orbit that was followed over whole periods, in NumPy.
 
-    codes, ends, entries (x1, x2, t), durations: of its arcs, as of a `Loop`; starts: the states
+    codes, ends, entries (x1, x2, t), durations: of its arcs, as in a `Loop`; starts: the states
     where periods begin, [periods + 1, 2]; status: of the run.
     """
 
@@ -32,13 +32,13 @@ class Followed(NamedTuple):
     status: int
 
     def last(self, periods: int) -> "Followed":
-        """The last periods of it."""
+        """Its last periods, `periods` in number."""
         cuts = np.flatnonzero(self.ends == Ends(self.codes.shape[-1]).period)
         first = 0 if periods >= len(cuts) else cuts[-periods - 1] + 1
         return self._cut(slice(first, None), slice(-periods - 1, None))
 
     def first(self, periods: int) -> "Followed":
-        """The first periods of it."""
+        """Its first periods, `periods` in number."""
         cuts = np.flatnonzero(self.ends == Ends(self.codes.shape[-1]).period)
         return self._cut(slice(cuts[periods - 1] + 1), slice(periods + 1))
 
@@ -47,14 +47,14 @@ class Followed(NamedTuple):
         return self._make([*parts, self.starts[starts], self.status])
 
     def loop(self) -> Loop:
-        """As a loop, padded to a size of chains."""
+        """Its arcs as a loop, see `padded_loop`."""
         return padded_loop(self.codes, self.ends, self.entries, self.durations)
 
 
 def arcs_over(osc: Oscillator, y0: Any, turns: int, share: float = 0.0) -> Followed:
-    """The orbit from the state y0 at the phase 0, over PERIODS_AT_ONCE periods, if it gets so far.
+    """The orbit from y0 at the phase 0 over PERIODS_AT_ONCE periods, or fewer where the run fails.
 
-    osc: known, in its own units. share: of a period, at which it begins instead.
+    osc: concrete, in its own units. share: fraction of a period at which y0 is, in place of 0.
     """
     period = float(forcing_period(osc, turns))
     cuts = period * (np.arange(1, PERIODS_AT_ONCE + 1) + share)
@@ -63,7 +63,7 @@ def arcs_over(osc: Oscillator, y0: Any, turns: int, share: float = 0.0) -> Follo
     modes, times = np.asarray(arcs.mode, float), np.asarray(arcs.t)
     entries = np.column_stack([np.asarray(arcs.y), times])
     reached = int(np.sum(np.all(np.isfinite(states), axis=1)))
-    # Arcs of one mode, one after the other, are one; and at the end of a period one is cut.
+    # Successive arcs of one mode are merged, and arcs are cut at the ends of periods.
     begins = np.flatnonzero(np.any(np.diff(modes, axis=0, prepend=np.nan) != 0, axis=1))
     names = Ends(modes.shape[1])
     rows = [(entries[i, 2], 0, entries[i], modes[i]) for i in begins.tolist()]
@@ -90,7 +90,7 @@ def arcs_over(osc: Oscillator, y0: Any, turns: int, share: float = 0.0) -> Follo
 
 
 def _end_between(names: Ends, before: np.ndarray, after: np.ndarray) -> int:
-    """What ends an arc, a number of `Ends`, by the codes of it and of the next one."""
+    """The number in `Ends` of the event between two arcs, from the contact codes of both."""
     n = len(before)
     apart = np.abs(before) > 1, np.abs(after) > 1
     for i in np.flatnonzero(apart[0] != apart[1]).tolist():
@@ -102,7 +102,7 @@ def _end_between(names: Ends, before: np.ndarray, after: np.ndarray) -> int:
 
 
 def after_period(osc: Oscillator, followed: Followed) -> np.ndarray:
-    """The last state, from which to go on, exactly on the belt that the mass sticks to."""
+    """The last state, to continue from; x2 is exactly the velocity of a belt that it sticks to."""
     x1, x2 = followed.starts[-1].tolist()
     mode = mode_of(jnp.asarray(followed.codes[-1]))
     began = at_time(osc, jnp.asarray(followed.entries[0, 2]))

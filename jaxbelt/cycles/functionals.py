@@ -1,6 +1,6 @@
-"""Functionals: one number of a cycle, to be swept, plotted, fitted or designed.
+"""Functionals: scalar functions of a cycle, which can be swept, plotted, fitted or designed.
 
-Each takes a `Cycle`, and all but `gap` and the energies a `PeriodicMotion`, too. It returns a
+Each takes a `Cycle`; all but `gap` and the energies take a `PeriodicMotion`, too. It returns a
 scalar that is differentiable with respect to the oscillator's parameters, forward and reverse, and
 works on batches under `jax.vmap`. All quantities are dimensionless: times in units of 1/omega,
 energies in units of k L^2 where L is the unit of length. Where the status of the cycle is not OK
@@ -25,7 +25,7 @@ from .shooting import flow
 
 
 def period(cycle: Cycle | PeriodicMotion) -> Array:
-    """Duration of one loop, of a forced motion of all the periods after which it repeats.
+    """Duration of one loop; for a forced motion, of all periods of the forcing until it repeats.
 
     Args:
         cycle: A cycle, or a motion of a forced oscillator, from `find_cycle` for example.
@@ -221,8 +221,7 @@ def _energies(cycle: Cycle) -> Array:
 
 
 def _powers(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
-    """Power [fed, dissipated] in a mode. A stuck contact holds the needed force, with the sign
-    changed.
+    """Power [fed, dissipated] in a mode. The friction of a stuck contact is minus the needed force.
 
     Belts that are stuck together share one velocity, so only the sum of their forces counts.
     """

@@ -24,7 +24,7 @@ from .shooting import flow
 class ClosedMotion(eqx.Module):
     """A chain of arcs that repeats.
 
-    unknowns: state and duration of every arc, [arcs, parts of the state and 1].
+    unknowns: entry state (d numbers) and duration of every arc, [arcs, d + 1].
     """
 
     oscillator: eqx.AbstractVar[Oscillator]
@@ -54,18 +54,19 @@ class ClosedMotion(eqx.Module):
 
     @abc.abstractmethod
     def _extremum(self, number: int) -> Array:
-        """The smallest x1 (0), the largest x1 (1), or the same of x2 (2, 3)."""
+        """By number: smallest x1 (0), largest x1 (1), smallest x2 (2), largest x2 (3)."""
 
     @property
     def stick_durations(self) -> Array:
-        """Time that it sticks to each belt until it repeats, in all stick phases, [belts]."""
+        """Time for which the mass sticks to each belt until the motion repeats, [belts]."""
         # A product, so that NaN stays, also for a belt that the mass does not stick to.
         stuck = jnp.where(self.chain.codes == STUCK, 1.0, 0.0)
         return jnp.sum(self.unknowns[..., -1:] * stuck, axis=-2)
 
     @property
     def arcs(self) -> Arcs:
-        """The arcs, smooth pieces in one mode each; NaN, or cut off, where unused."""
+        """The arcs, smooth pieces in one mode each. Unused ones are NaN under a trace or in a
+        batch, and cut off otherwise."""
         used, durations = self.chain.used, self.unknowns[..., -1]
         nan = functools.partial(jnp.where, used)
         arcs = Arcs(
@@ -100,7 +101,7 @@ class ClosedMotion(eqx.Module):
 
     @property
     def since_beginning(self) -> Array | None:
-        """The time from where its chain begins to where its samples begin; None: 0."""
+        """Time from the beginning of the chain to the beginning of the samples; None: 0."""
         return None
 
 

@@ -23,14 +23,14 @@ from ..numerics.newton import solve
 from ..numerics.padding import filled_up, in_batches, longer
 from .outlines import Outline, Pieces, place_on
 
-#: Parts of a piece; pairs of parts that are solved for in one batch, and pieces that are sampled.
+#: Parts of a piece; pairs of parts solved for in one batch; pieces sampled in one batch.
 PARTS, PAIRS, PIECES = 16, 64, 32
 #: Longest Newton step, as a fraction of a piece: two parts.
 LONGEST_PART = 2 / PARTS
-#: How far a solution may still move, as a fraction of a piece, and its largest error in x1 along
-#: x2.
+#: How far a solution may still move, as a fraction of a piece; also the largest difference in x1
+#: between the ends of a way along x2.
 FOUND = 1e-9
-#: A solution that is so far beyond its part is accepted, too, as a fraction of a piece.
+#: A solution outside its part by no more than this fraction of a piece is accepted, too.
 BEYOND = 0.25 / PARTS
 
 
@@ -39,8 +39,8 @@ class Meeting(eqx.Module):
 
     Attributes:
         pieces: Number of the piece of each curve, [2].
-        fractions: Where on it, [2].
-        fixed: Whether that is an end of the piece, where the curve may have a corner, [2].
+        fractions: Place on each piece, [2].
+        fixed: Whether the place is an end of the piece, where the curve may have a corner, [2].
     """
 
     pieces: Array
@@ -52,8 +52,8 @@ class Normal(Equations):
     """The two equations of a `Meeting` in its fractions.
 
     With P on the first curve, Q on the second and d = P - Q: in any direction d is normal to both
-    curves; along x2 d1 = 0, and the curves are parallel. A fixed fraction is an equation alone and
-    replaces its own, along x2 the second one; two of them replace both.
+    curves; along x2 d1 = 0, and the curves are parallel. A fixed fraction replaces the equation of
+    its own curve by z = known, along x2 the second equation; two fixed fractions replace both.
 
     given: oscillator; the two pieces, rows of `Pieces` stacked; the known fractions; fixed.
     """
@@ -89,10 +89,10 @@ def places_on(osc: Oscillator, pieces: Pieces, fractions: Array) -> tuple[Array,
 
 
 class Sampled(NamedTuple):
-    """A curve of a known oscillator in parts; see `in_parts`.
+    """A curve of a concrete oscillator in parts; see `in_parts`.
 
-    pieces: of the curve. piece: its number, of each part; begin: where on it the part begins, a
-    fraction; low, high: corners of the part's box, [parts, 2].
+    pieces: of the curve. Of each part, piece: number of its piece; begin: fraction of the piece at
+    which the part begins; low, high: corners of the part's box, [parts, 2].
     """
 
     pieces: Pieces
@@ -103,7 +103,7 @@ class Sampled(NamedTuple):
 
 
 def in_parts(osc: Oscillator, pieces: Pieces) -> Sampled:
-    """A curve of a known oscillator, cut into parts of its pieces."""
+    """A curve of a concrete oscillator, each of its pieces cut into PARTS parts."""
     has_extent = (np.asarray(pieces.durations) != 0) | (np.asarray(pieces.lengths) != 0)
     # A point is one piece, of one part.
     is_point = not np.any(has_extent)
@@ -135,14 +135,14 @@ def shortest_between(
     """The shortest way from one curve to another.
 
     Args:
-        osc: A known oscillator.
+        osc: A concrete oscillator.
         first: Curve where the way begins.
         second: Curve where it ends.
-        along_x2: Whether it has to keep x1.
+        along_x2: Whether x1 has to stay constant along the way.
 
     Returns:
         Its length, its end, [2], and where it is. inf, NaN and None if there is none; NaN, NaN and
-        None where Newton's method finds none that is as short as it is known to be.
+        None where Newton's method finds none as short as the upper bound from the boxes.
     """
     curves = first, second
     parts, fractions, fixed, least, limit = _tries_of(first, second, along_x2)
@@ -155,7 +155,8 @@ def shortest_between(
         pieces = [filled_up(curves[k].pieces, number[:, k], PAIRS) for k in (0, 1)]
         found = _solved_for(osc, *pieces, *filled_up((fractions, fixed), now, PAIRS), along_x2)
         z, to, d, moves = (np.asarray(one)[: now.size] for one in found)
-        # Where a piece ends above the other curve, as on an edge, rounding decides on which side.
+        # Where a piece ends just above the other curve, as on an edge, rounding decides on which
+        # side of that end the solution lies.
         inside = np.maximum(begin - BEYOND, -FOUND) <= z
         inside &= z <= np.minimum(begin + 1 / PARTS + BEYOND, 1 + FOUND)
         good = np.all(inside | fixed[now], axis=1) & (moves < FOUND)
@@ -202,7 +203,8 @@ def _tries_of(one: Sampled, other: Sampled, along_x2: bool) -> tuple[Any, ...]:
 def _solved_for(
     osc: Oscillator, first: Pieces, second: Pieces, start: Array, fixed: Array, along_x2
 ):
-    """For each row: fractions, the end of the way there, d, and how far fractions still move."""
+    """For each row the fractions, the end of the way, d = P - Q, and how far fractions still
+    move."""
 
     def one(first, second, start, fixed):
         pieces = _both_pieces(first, second)
@@ -214,7 +216,7 @@ def _solved_for(
 
 
 def _both_pieces(*two: Pieces) -> Pieces:
-    """Two rows of `Pieces`, stacked. Steps that are added are of length zero."""
+    """Two rows of `Pieces`, stacked; the shorter mesh is padded by steps of length zero."""
     steps = max(one.mesh.shape[-1] for one in two)
     padded = [
         eqx.tree_at(lambda p: p.mesh, one, longer(one.mesh, steps, axis=-1, fill=0.0))
@@ -224,12 +226,12 @@ def _both_pieces(*two: Pieces) -> Pieces:
 
 
 class ShortestWay(eqx.Module):
-    """The shortest way between two outlines, known where it is at one oscillator.
+    """The shortest way between two outlines, located for one oscillator.
 
     Attributes:
         first: Outline on which it begins.
         second: Outline on which it ends.
-        meeting: Where that is.
+        meeting: Where on these it begins and ends, for that oscillator.
         along_x2: Whether it is along x2.
     """
 

@@ -35,24 +35,24 @@ from ..results import Status
 from .chains import Loop
 from .settling import AT_REST, has_repeated
 
-#: Arcs for which an orbit is followed before it is given up: some 100 loops.
+#: Largest number of arcs for which an orbit is followed: some 100 loops.
 MOST_ARCS = 1024
 #: The stride of `Graded` with which every arc is accurate to 1e-12; with STRIDE it is to some 1e-8.
 FINE_STRIDE = 0.05
-#: The speed down to which a creeping fine orbit is followed.
+#: The speed |x2| down to which `follow_finely` follows a creeping orbit.
 CREEPING_SPEED = 1e-6
-#: Largest distance from an equilibrium at which such an orbit ends.
+#: Distance from its equilibrium within which `follow_finely` ends an orbit.
 SEEN_AT_REST = 1e-2
 
 
 class Orbit(eqx.Module):
     """The arcs of an orbit, in rows up to `count`: entry, duration, codes, and end event.
 
-    tops: x1 where an arc ended in a maximum of x1, else NaN. repeats: row of the top that the last
-    one repeats, else -1. y, code, signs: present state. top: that of the last arc; top_before: the
-    last top, NaN where there was none. low, low_before: the smallest x1 since then, and between
-    that and the one before. sticks: whether it has stuck since. repellers: x1 of the pseudo-foci to
-    which no loop shrinks.
+    tops: x1 where an arc ended in a maximum of x1, a top, else NaN. repeats: row of the top that
+    the last arc's top repeats, else -1. y, code, signs: present state. top: `tops` of the last arc;
+    top_before: x1 of the latest top, NaN where there was none. low: smallest x1 since the latest
+    top; low_before: smallest x1 between that and the top before. sticks: whether the mass has stuck
+    since the latest top. repellers: x1 of the pseudo-foci to which no loop shrinks.
     """
 
     entries: Array
@@ -82,7 +82,7 @@ class Orbit(eqx.Module):
 
 
 def _arc(osc: Oscillator, orbit: Orbit, stride: float | Array, reach: float | Array) -> ArcEnd:
-    """The next arc of an orbit, to an extremum at most."""
+    """The next arc of an orbit; it ends at the next extremum at the latest."""
     mode, y = mode_of(orbit.code), (orbit.y[0], orbit.y[1])
 
     def slip():
@@ -104,15 +104,15 @@ def _graded_slip_arc(
 def _next_arc(
     osc: Oscillator, orbit: Orbit, stride: float | Array, reach: float | Array
 ) -> tuple[dict[str, Array], Orbit]:
-    """The next arc, a row of the columns by name; and the orbit after it, without that row."""
+    """The next arc as a row, by column name, and the orbit after it, that row not yet written."""
     codes = orbit.code
     stuck = mode_of(codes).any_stuck
     end = _arc(osc, orbit, stride, reach)
     y_end = jnp.stack(end.y)
     code = jnp.stack([jnp.asarray(c, dtype=orbit.y.dtype) for c in end.mode.codes])
 
-    # Whatever ends the arc: at the boundary of a belt at rest it is not the guard of extrema. Where
-    # that belt creeps x2 is set back to its velocity, and may change its sign without falling.
+    # Any guard may end an arc in a top, that of extrema or that of a boundary (of a belt at rest).
+    # On a creeping belt x2 is set back to the belt's velocity and may change sign without falling.
     is_top = ~stuck & (orbit.signs[1] > 0) & ~end.mode.any_stuck & (end.signs[1] < 0)
     is_top = is_top & (end.signs[0] < 0)
     top = jnp.where(is_top, y_end[0], jnp.nan)
@@ -165,7 +165,7 @@ def _followed_while(
     stride: float | Array = STRIDE,
     reach: float | Array = jnp.inf,
 ) -> Orbit:
-    """Arc after arc, from no arcs, as long as there is room and `going` holds.
+    """Follows an orbit without arcs yet, arc by arc, while there is room and `going` holds.
 
     An arc also ends where |x1| or |x2| reaches `reach`.
     """
@@ -176,7 +176,7 @@ def _followed_while(
     def turn(state):
         number, orbit = state
         row, after = _next_arc(osc, orbit, stride, reach)
-        # Of the columns, long ones, one row is written, the same in all lanes of a batch.
+        # Only one row of the long columns is written, the same one in all lanes of a batch.
         own = unfinished(orbit)
         columns = {name: getattr(orbit, name) for name in row}
         written = {
@@ -229,17 +229,17 @@ def follow(osc: Oscillator, y0: Array, budget: int, stride: float | Array = STRI
 
 
 def follow_from(osc: Oscillator, mode: Mode, y0: Array, status: Array, budget: int) -> Orbit:
-    """The orbit that leaves y0 in a mode, as in `follow`; none where the status is not OK."""
+    """The orbit that leaves y0 in a mode, as in `follow`; no arcs where the status is not OK."""
     osc, mode, y0 = lax.stop_gradient((osc, mode, y0))
     start = _standing(osc, mode, y0, status, budget)
     return _settled_or_not(_follow_from(osc, start, jnp.asarray(STRIDE)))
 
 
 def follow_to_top(osc: Oscillator, y0: Array, budget: int) -> tuple[Orbit, Array]:
-    """The orbit from y0 until a top, or it comes to rest; and x1 at the top, NaN where there is
-    none.
+    """The orbit from y0 to its first top, or until it comes to rest; and x1 of the top, NaN where
+    there is none.
 
-    The oscillator has to be possible, or one that is reversed in time.
+    osc: with possible numbers (`has_possible_numbers`), or such an oscillator reversed in time.
     """
     osc, y0 = lax.stop_gradient((osc, y0))
     orbit = _to_top_from(osc, _beginning(osc, y0, budget, jnp.asarray(True)))
@@ -257,7 +257,7 @@ def follow_finely(osc: Oscillator, mode: Mode, y0: Array, budget: int, reach: Ar
 
 
 def place_of_rest(osc: Oscillator, orbit: Orbit) -> Array:
-    """x1 where an orbit has come to rest, to the last digit; NaN where it has not."""
+    """x1 where an orbit has come to rest, up to rounding; NaN where it has not."""
     last = jnp.arange(orbit.tops.size) == orbit.count - 1
     held = jnp.sum(jnp.where(last, orbit.entries[:, 0], 0.0))
     mode = mode_of(orbit.code)
@@ -277,7 +277,7 @@ def _settled_or_not(orbit: Orbit) -> Orbit:
 
 
 def _beginning(osc: Oscillator, y0: Array, budget: int, possible: Array) -> Orbit:
-    """An orbit at y0, with room for as many arcs as the budget."""
+    """An orbit at y0 without arcs yet, with room for `budget` arcs."""
     rests = begins_at_rest(osc, y0[0], y0[1])
     focus = at_focus(osc, y0[0], y0[1])
     status = jnp.where(rests, Status.EQUILIBRIUM.value, Status.OK.value)
@@ -312,10 +312,10 @@ def _standing(osc: Oscillator, mode: Mode, y0: Array, status: Array, budget: int
 
 
 def last_loop(orbit: Orbit) -> tuple[Array, Array]:
-    """(first row, number of rows) of the loop that repeats.
+    """(first row, number of rows) of the loop that repeats, rows counted from the repeated top.
 
     It begins at the end of the longest stick phase; if there is none, at the top. Rows are to be
-    taken modulo the number, see `loop_of`.
+    taken modulo their number, see `loop_of`.
     """
     rows = jnp.arange(orbit.durations.size)
     size = orbit.count - 1 - orbit.repeats
@@ -340,7 +340,8 @@ def loop_of(orbit: Orbit, size: int, n: int) -> Loop:
 def first_loop(osc: Oscillator, x1: Array, distance: Array, size: int):
     """The orbit from (x1 + distance, 0) to its first maximum of x1, within `size` arcs.
 
-    Returns it as if that loop repeated, whether it meets a boundary, and x1 there (NaN: none).
+    Returns the orbit as if that loop repeated, whether the loop meets a boundary, and x1 of the
+    maximum (NaN: there is none).
     """
     orbit = follow(osc, jnp.stack([x1 + distance, jnp.zeros(())]), size)
     is_top = ~jnp.isnan(orbit.tops)
@@ -352,11 +353,11 @@ def first_loop(osc: Oscillator, x1: Array, distance: Array, size: int):
 
 
 def before_stick_ends(osc: Oscillator, belt: int | Array) -> Array:
-    """States stuck to a belt where stick phases end, one for each zone between contact edges,
+    """States stuck to a belt at the ends of stick phases, one for each zone between contact edges,
     [zones, 2].
 
-    Shortly before slip onset; or, where the zone ends first, on the edge. NaN where neither exists,
-    or the belt does not touch.
+    They lie shortly before slip onset, or on the edge where the zone ends first. NaN where neither
+    exists, or the belt does not touch.
     """
     v = velocity_of(osc, belt) / osc.omega
     lower, upper = zone_ends(osc)
@@ -364,7 +365,7 @@ def before_stick_ends(osc: Oscillator, belt: int | Array) -> Array:
     onset, held = onset_position(osc, mode), capacity(osc, mode)
     before, ahead = select(v > 0, (lower, upper), (upper, lower))
     slips = (lower < onset) & (onset < upper)
-    # It holds between onset - 2 sgn(v) held and onset.
+    # The mass sticks between x1 = onset - 2 sgn(v) held and x1 = onset.
     meets = jnp.isfinite(ahead) & ~slips & (jnp.abs(onset - held * jnp.sign(v) - ahead) <= held)
     near = jnp.minimum(0.01 * held, 0.5 * jnp.abs(onset - before))
     exists = (jnp.stack(mode.codes)[belt] == STUCK) & (lower < upper)

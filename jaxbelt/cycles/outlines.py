@@ -72,7 +72,7 @@ class Pieces(eqx.Module):
 
 
 def straight(osc: Oscillator, x1: Array, to: Array, x2: Array) -> Pieces:
-    """A straight line along x1, or a point; belts that do not touch need no computation."""
+    """A straight line along x1, or a point; all belts count as not touching, to save work."""
     one, away = jnp.ones(1), jnp.full((1, len(osc.belts)), float(ABOVE))
     return Pieces(one, away, one[None], jnp.stack([x1, x2])[None], 0 * one, (to - x1) * one)
 
@@ -109,7 +109,7 @@ class StraightOutline(Outline):
     """A straight line along x1, or a point.
 
     Attributes:
-        belt: Belt on whose boundary it lies, see `jumps`; -1: where the mass can rest.
+        belt: Belt on whose boundary it lies, see `jumps`; -1: it consists of equilibria.
         first: Row of `jumps`, or of `equilibria`, where it begins.
         last: Row where it ends.
     """
@@ -131,13 +131,13 @@ class StraightOutline(Outline):
 def jumps(osc: Oscillator, belt: Array) -> tuple[Array, Array, Array]:
     """Pieces of the boundary of a belt that divide motions.
 
-    Where the static limit of a belt exceeds mu(0) a mass that comes to its boundary from one side
-    is held up to the static limit, and one that is on the other side slips away. There is one such
-    piece where the needed force pulls to the left, and one where it pulls to the right.
+    Where the static limit of a belt exceeds mu(0), a mass that reaches its boundary from one side
+    is held up to the static limit, and a mass on the other side slips away. In each zone there is
+    one such piece where the needed force pulls to the left, and one where it pulls to the right.
 
     Returns:
-        The least and the largest x1 of each, [2 * zones], of all zones first of those to the left,
-        NaN where there is none; and x2 of the boundary.
+        The least and the largest x1 of each piece, [2 * zones], first of the pieces at smaller x1
+        of all zones, NaN where there is none; and x2 of the boundary.
     """
     v = velocity_of(osc, belt) / osc.omega
     low, high = zone_ends(osc)
@@ -156,7 +156,7 @@ def jumps(osc: Oscillator, belt: Array) -> tuple[Array, Array, Array]:
 
 
 class ClosedOutline(Outline):
-    """A cycle; way: -1 where it was solved for backwards."""
+    """A cycle; way: -1 where it was solved for in reversed time, else 1."""
 
     chain: Chain
     unknowns: Array
@@ -212,7 +212,7 @@ class OpenOutline(Outline):
 def _one_after_another(osc: Oscillator, chain: Chain, durations: Array, y: Array):
     """Entries and durations of the arcs of an open chain, from its beginning.
 
-    Known durations are good to rounding. One Newton step gives each its first derivative.
+    The given durations are exact up to rounding. One Newton step gives each its first derivatives.
     """
     unused = Ends(len(osc.belts)).unused
 
@@ -236,10 +236,10 @@ def _chain_of(osc: Oscillator, loop: Loop) -> Chain:
 
 
 def _cut_finely(osc: Oscillator, loop: Loop) -> Loop:
-    """Arcs in a row, those that need more than STEPS steps cut into pieces.
+    """Successive arcs, those that need more than STEPS steps cut into pieces.
 
-    A piece that is not the last of its arc has no end event ("unused"). Rows that pad it have no
-    duration. An arc may creep: to a node on the boundary of a belt, for example, near which it
+    A piece that is not the last of its arc has no end event ("unused"). Rows of padding have the
+    duration zero. An arc may creep: to a node on the boundary of a belt, for example, near which it
     stays for a hundred times as long as it moved.
     """
     count = len(loop.ends)
@@ -249,7 +249,7 @@ def _cut_finely(osc: Oscillator, loop: Loop) -> Loop:
     idle = np.flatnonzero(left[:count] == 0)
     found = [(idle, entries[idle], left[idle])]
     while np.any(left > 0):
-        # Arcs that are done take no step.
+        # Arcs that are cut to their ends take no step.
         cut = _first_pieces(osc, padded.codes, *jax.device_put((entries, left)))
         ts, states = map(np.asarray, cut)
         begins = np.concatenate([entries[:, None], states[:, :-1]], axis=1)

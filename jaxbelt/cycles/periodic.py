@@ -52,22 +52,23 @@ from .motions import ClosedMotion
 if TYPE_CHECKING:
     import pandas
 
-#: Errors that the steps of integration leave in the equations; with more they are halved, so often.
+#: Error of the equations that integration steps may leave; how often steps are halved to reach it.
 EXACT_MOTION, MESH_HALVINGS = 1e-11, 3
-#: Unknowns that still move by less are known: near a fold rounding moves them by 1e-9 and more.
+#: Newton's method has settled if unknowns move by less; near a fold rounding moves them by 1e-9 and
+#: more.
 KNOWN_MOTION = 1e-7
-#: States of two motions that differ by less are one; of one motion, each of which is known to
-#: KNOWN_MOTION, where the least number of periods is asked for.
+#: States of two motions that differ by less are the same; and states of one motion, each exact to
+#: KNOWN_MOTION, where its least number of periods is determined.
 SAME_STATE, SAME_OF_MOTION = 1e-7, 1e-6
-#: Arcs that take no longer lie between an event and the beginning of a period, maybe.
+#: An arc no longer than this may lie between an event and the beginning of a period.
 AT_PHASE_0 = 1e-4
-#: How far from events a chain has to begin, over the longest time between two of them.
+#: Least time from an event to where a chain begins, over the longest time between two events.
 OFF_EVENTS = 0.25
-#: Multipliers are known to this: nearer to the unit circle they may be on it, as without damping.
+#: Error of multipliers: nearer to the unit circle they may be on it, as without damping.
 ON_THE_CIRCLE = 1e-9
-#: What to do where periodic motions cannot be looked for.
+#: Advice of the error message where periodic motions cannot be searched for.
 IN_TRACES = "under jit and vmap use motion.at(osc) of a motion that was found outside"
-#: Newton steps on the state at phase 0 where the arcs that were followed are not those sought.
+#: Newton steps on the state at phase 0 where the followed arcs are not those of the motion.
 OUTER_STEPS = 12
 
 
@@ -77,14 +78,14 @@ class PeriodicMotion(ClosedMotion):
     Differentiable with respect to every parameter of its oscillator.
 
     Attributes:
-        oscillator: Whose motion it is.
+        oscillator: The oscillator.
         chain: Its arcs; padded. They begin at the phase 0, or, where events are near to that, at
             another phase, `chain.share` of a period.
         unknowns: (x1, x2, t, duration) at the entry of every arc, t counted from the last phase 0
             before the arcs of a period begin, [arcs, 4].
-        multipliers: Both Floquet multipliers, complex, the larger one first; both to about 1e-15 of
-            it, beyond which only `lyapunov` knows how areas shrink. Of a motion that sticks the
-            second is exactly 0.
+        multipliers: Both Floquet multipliers, complex, the larger one first, both with an error of
+            about 1e-15 of the larger; how areas shrink beyond that only `lyapunov` tells. If the
+            motion sticks, the second is exactly 0.
         residual: Largest error in the equations.
         iterations: Newton steps.
         status: A `Status` code; where it is not OK every number is NaN.
@@ -100,7 +101,7 @@ class PeriodicMotion(ClosedMotion):
 
     @property
     def periods(self) -> int:
-        """After how many periods of the forcing it repeats."""
+        """Number of periods of the forcing after which it repeats."""
         return periods_of(self.chain)
 
     @property
@@ -137,7 +138,7 @@ class PeriodicMotion(ClosedMotion):
         if self.chain.share is not None:
             states = _at_phase_0(self)
             passes = np.flatnonzero(np.isfinite(np.asarray(states[:, 0])))
-            # Without a motion as many as it has periods.
+            # Without a motion all states are NaN: return as many rows as it has periods.
             return states[passes if passes.size else np.arange(self.periods)]
         cuts = np.flatnonzero(np.asarray(self.chain.ends) == self._ends.period)
         return self.unknowns[jnp.asarray(np.append(0, cuts[:-1] + 1)), :2]
@@ -151,7 +152,7 @@ class PeriodicMotion(ClosedMotion):
         return jnp.all(jnp.abs(self.multipliers) < 1 - ON_THE_CIRCLE, axis=-1)
 
     def at(self, osc: Oscillator) -> "PeriodicMotion":
-        """The motion with the same signature of another oscillator, near to its own.
+        """The motion of another oscillator, close to its own, with the same signature.
 
         Works under `jax.jit`, `jax.vmap` and derivatives. There it keeps the steps of integration
         of this motion; where they are too long for the other one its status is NO_CONVERGENCE.
@@ -172,7 +173,7 @@ class PeriodicMotion(ClosedMotion):
                 if moved is not self:
                     found = motion_at_unknowns(own, *moved._guess_for(osc, own))
             return in_given_units(found, osc, own)
-        # Of many oscillators an event may pass the phase 0 in some.
+        # In a batch of oscillators, an event may cross the phase 0 for some of them.
         known = self._begun_off_events() if is_single and is_outermost(self) else self
         found, _ = _polished_motion(own, *known._guess_for(osc, own), jnp.asarray(HOLDS))
         return in_given_units(found, osc, own)
@@ -185,7 +186,7 @@ class PeriodicMotion(ClosedMotion):
         return self.chain, lax.stop_gradient(z)
 
     def _begun_off_events(self) -> "PeriodicMotion":
-        """See `begun_off_events`."""
+        """`begun_off_events` of this motion, in the oscillator's own units and back."""
         own = in_own_units(self.oscillator)
         if own is self.oscillator:
             return begun_off_events(own, self)
@@ -194,7 +195,7 @@ class PeriodicMotion(ClosedMotion):
         return self if moved is motion else in_given_units(moved, self.oscillator, own)
 
     def row(self) -> dict[str, Any]:
-        """What `table` tells of it."""
+        """The row of the motion in `table`."""
         require_single(self, self.residual, 0)
         known = int(self.status) == Status.OK
         start, (first, second) = np.asarray(self.start), np.asarray(self.multipliers)
@@ -249,7 +250,7 @@ class PeriodicMotion(ClosedMotion):
 
 
 def extrema_of(motion: PeriodicMotion) -> Array:
-    """Smallest and largest x1, and those of x2, of a motion or of each of a batch, [..., 4]."""
+    """Smallest and largest x1, then x2, of a motion or of each of a batch, [..., 4]."""
     function = _extrema
     for _ in range(motion.unknowns.ndim - 2):
         function = jax.vmap(function)
@@ -274,10 +275,10 @@ def _at_phase_0(motion: PeriodicMotion) -> Array:
 def _polished_motion(
     osc: Oscillator, chain: TimedChain, guess: Array, most: Any = np.inf
 ) -> tuple[PeriodicMotion, Array]:
-    """The motion near a guess of a chain's unknowns, and the error that its steps leave; with more
-    than `most` of it there is none."""
+    """The motion near a guess of a chain's unknowns, and the error that its integration steps
+    leave; where this exceeds `most`, the status is NO_CONVERGENCE."""
     solved = solve(TimedClosed(chain), osc, guess)
-    # Where it sticks all along, no place is better than another: it is where it is, or nowhere.
+    # A motion that sticks all the time may lie anywhere: the guess is a solution, or there is none.
     always = jnp.all(jnp.any(chain.codes == STUCK, axis=-1) | ~chain.used)
     z, settled = jnp.where(always, guess, solved.z), solved.unsettled
     still, at = lax.stop_gradient((osc, z))
@@ -292,7 +293,7 @@ def _polished_motion(
 
 
 def motion_at(osc, chain, z, residual, iterations, status) -> PeriodicMotion:
-    """The motion with the unknowns z, NaN with a status where it is none."""
+    """The motion with the unknowns z; NaN, and a status, where these are no motion."""
     inside = timed_admissible(*lax.stop_gradient((osc, chain, z)))
     status = first_failure(status, inside, Status.NOT_ADMISSIBLE)
     return _motion(osc, chain, z, residual, iterations, status)
@@ -307,7 +308,7 @@ def _motion(osc, chain, z, residual, iterations, status) -> PeriodicMotion:
 
 @jit
 def _motion_with_derivatives(osc: Oscillator, motion: PeriodicMotion) -> PeriodicMotion:
-    """A motion that is known, as one of an oscillator by which it can be differentiated."""
+    """A motion found before, as a differentiable function of its oscillator."""
     chain, status = motion.chain, motion.status
     z = solution(TimedClosed(chain), osc, lax.stop_gradient(motion.unknowns))
     return _motion(osc, chain, z, motion.residual, motion.iterations, status)
@@ -316,7 +317,7 @@ def _motion_with_derivatives(osc: Oscillator, motion: PeriodicMotion) -> Periodi
 def solved_from(
     osc: Oscillator, loop: Loop, turns: int, share: Array | None = None
 ) -> PeriodicMotion:
-    """The motion that a loop nearly is, with as many steps of integration as it takes; share: see
+    """The motion near a loop, with as many integration steps as it needs; share: see
     `TimedChain`."""
     chain, guess = timed_chain_of(osc, loop, turns, share)
     motion, error = _polished_motion(osc, chain, guess)
@@ -333,8 +334,8 @@ def solved_from(
 
 
 def motion_at_unknowns(osc: Oscillator, chain: TimedChain, z: Array) -> PeriodicMotion:
-    """The motion near the unknowns of a chain, which may be another oscillator's: with steps of its
-    own where those of the chain leave an error."""
+    """The motion near the unknowns of a chain, which may be of another oscillator; it gets
+    integration steps of its own where those of the chain leave an error."""
     motion, error = _polished_motion(osc, chain, z)
     converged = int(motion.status) in (Status.OK, Status.NOT_ADMISSIBLE)
     if not converged or float(error) < EXACT_MOTION:
@@ -343,8 +344,8 @@ def motion_at_unknowns(osc: Oscillator, chain: TimedChain, z: Array) -> Periodic
 
 
 def _without_doubles(osc: Oscillator, motion: PeriodicMotion) -> PeriodicMotion:
-    """The motion; where an event at the phase 0 may stand at both ends of its chain, the chain
-    begins elsewhere."""
+    """The motion; its chain begins at another phase where an event at the phase 0 may occur at
+    both ends of the chain."""
     if int(motion.status) != Status.OK:
         return motion
     used = np.asarray(motion.chain.used)
@@ -356,8 +357,8 @@ def begun_off_events(osc: Oscillator, motion: PeriodicMotion) -> PeriodicMotion:
     """The motion with a chain that begins where no event is near: in the middle of the longest time
     between any two phases with events, before the phase 0 of `motion.start`.
 
-    As it is where that is hardly farther from events, or where following the motion from there does
-    not lead to it. osc: its oscillator, known, in own units.
+    The motion is returned unchanged where that is hardly farther from events, or where the orbit
+    from there leads to another motion. osc: its oscillator, concrete, in own units.
     """
     chain, z = motion.chain, np.asarray(motion.unknowns)
     period = float(forcing_period(osc, chain.turns))
@@ -386,12 +387,12 @@ def begun_off_events(osc: Oscillator, motion: PeriodicMotion) -> PeriodicMotion:
 def state_near_start(
     osc: Oscillator, motion: PeriodicMotion, share: float, *, before: bool = False, later: int = 0
 ) -> np.ndarray:
-    """The state of a motion at a share of a period, the first one after `motion.start`, or the last
-    one before it, or so many periods later."""
+    """The state of a motion at a fraction of a period, `share`: the first one after `motion.start`,
+    the last one before it (`before`), or that `later` periods after the first."""
     chain = motion.chain
     states = np.asarray(_passing_states(osc, chain, motion.unknowns, jnp.asarray(share)))
     passes = np.flatnonzero(np.isfinite(states[:, 0]))
-    # Whether the first of them is before the first phase 0 of the chain.
+    # Whether the first of these states is before the first phase 0 of the chain.
     is_first = chain.share is not None and share >= float(chain.share)
     place = (0 if is_first else -1) if before else (int(is_first) + later) % len(passes)
     return states[passes[place]]
@@ -407,7 +408,7 @@ _passing_states = jit(states_at_phase)
 
 
 def state_at_phase_0(osc: Oscillator, chain: TimedChain, z: Array) -> np.ndarray:
-    """The state at the phase 0 of unknowns of a chain, whether they solve its equations or not."""
+    """The state at the phase 0 by the unknowns of a chain, which need not solve its equations."""
     if chain.share is None:
         return np.asarray(z)[0, :2]
     return np.asarray(_first_state(_passing_states(osc, chain, z, jnp.zeros(()))))
@@ -420,7 +421,7 @@ def _first_state(states: Array) -> Array:
 
 
 def nothing_found(osc: Oscillator, turns: int, status: int) -> PeriodicMotion:
-    """What is returned where there is no motion: NaN, and why."""
+    """A motion of NaN, with the status that says why there is none."""
     arcs, loop = SIZES[0], blank_loop(SIZES[0], len(osc.belts))
     chain = TimedChain(loop.codes, loop.ends, jnp.zeros((arcs, 1)), turns=turns)
     nan, none = jnp.asarray(jnp.nan), jnp.full((arcs, 4), jnp.nan)
@@ -431,9 +432,9 @@ def nothing_found(osc: Oscillator, turns: int, status: int) -> PeriodicMotion:
 def periodic_from(
     osc: Oscillator, guess: Any, periods: int, turns: int, share: float = 0.0
 ) -> PeriodicMotion:
-    """What `periodic` returns, of a known oscillator in its own units.
+    """What `periodic` returns, for a concrete oscillator in its own units.
 
-    share: of a period, at which the guess is; the motion's chain begins there.
+    share: fraction of a period at which the guess is; the motion's chain begins there.
     """
     y = np.asarray(guess, float)
     motion, begun_again = None, False
@@ -449,7 +450,7 @@ def periodic_from(
             goes_on = np.array_equal(followed.codes[0], followed.codes[-1])
             if goes_on or begun_again:
                 return of_least_periods(osc, motion, turns)
-            # It begins in another mode than it ends in: an arc of no duration is before an event.
+            # First and last mode differ: an arc of duration zero lies before an event.
             begun = np.asarray(motion.unknowns)[:1, :2]
             y = after_period(osc, followed._replace(starts=begun))
             begun_again = True
@@ -465,8 +466,8 @@ def periodic_from(
 def _period_step(
     osc: Oscillator, followed: Followed, turns: int, begins: Array | None
 ) -> np.ndarray:
-    """How far the state where periods begin is from that of a periodic motion, by Newton's method
-    along the orbit as it was followed."""
+    """The Newton step of the state where periods begin to that of a periodic motion, [2],
+    linearised along the followed orbit."""
     loop = followed.loop()
     chain, z = timed_chain_of(osc, loop, turns, begins)
     matrix = np.asarray(monodromy_of(osc, chain, z))
@@ -494,7 +495,8 @@ def of_least_periods(osc: Oscillator, motion: PeriodicMotion, turns: int) -> Per
 def motion_between_halves(
     osc: Oscillator, motion: PeriodicMotion, turns: int
 ) -> PeriodicMotion | None:
-    """The motion of half as many periods from which one may have left in a period doubling."""
+    """The motion of half as many periods, from which this one may have branched in a period
+    doubling; None if there is none."""
     half, odd = divmod(motion.periods, 2)
     if odd:
         return None
@@ -513,8 +515,8 @@ def periodic(osc: Oscillator, guess: ArrayLike | tuple, *, periods: int = 1) -> 
     Args:
         osc: An `Oscillator` with forcing.
         guess: State (x1, x2) at the phase 0, that is, at t = 0, shape [2].
-        periods: After how many periods of the forcing it repeats, 32 at most. A motion that
-            repeats earlier is given as what it is.
+        periods: Number of periods of the forcing after which it repeats, 32 at most. A motion that
+            repeats earlier is returned with its own number.
 
     Returns:
         The motion; where there is none its status says why.
@@ -538,7 +540,8 @@ def periodic(osc: Oscillator, guess: ArrayLike | tuple, *, periods: int = 1) -> 
 
 
 def differentiable_motion(osc: Oscillator, y: Array, find: Any) -> PeriodicMotion:
-    """What find(osc, y, turns) finds of the known oscillator in own units, as a function of osc."""
+    """The motion that find(osc, y, turns) returns for the concrete oscillator in own units, as a
+    differentiable function of `osc`."""
     still, y = lax.stop_gradient((osc, y))
     turns = turns_of(still)
     own = in_own_units(still)
@@ -551,7 +554,7 @@ def differentiable_motion(osc: Oscillator, y: Array, find: Any) -> PeriodicMotio
 
 
 def is_same_motion(one: PeriodicMotion, other: PeriodicMotion) -> bool:
-    """Whether two motions are one, wherever they begin."""
+    """Whether two motions are the same, whichever of their periods comes first."""
     if one.periods != other.periods:
         return False
     a, b = np.asarray(one.starts), np.asarray(other.starts)

@@ -35,13 +35,13 @@ from .separatrices import Separatrix, TracedSeparatrix, branches
 if TYPE_CHECKING:
     import pandas
 
-#: A top is on a cycle that is no farther away than this, relative to the distance from the origin.
+#: A top this near to the top of a cycle, relative to its distance from the origin, is on the cycle.
 ON_CYCLE = 1e-5
-#: An equilibrium as near to an edge as this is on it.
+#: An equilibrium this near to an edge lies on it.
 ON_EDGE = 1e-9
 #: Separatrices are followed up to this multiple of the reach, as they may come back into it.
 TRACED = 3.0
-#: An orbit without an end that gets so near to a point of rest tends to it.
+#: An orbit that has not settled, but comes this near to a point of rest, tends to it.
 CREEPING = 1e-3
 
 
@@ -54,14 +54,14 @@ class Portrait(eqx.Module):
     Attributes:
         oscillator: The oscillator.
         equilibria: All of them, saddles included, see `Equilibria`.
-        cycles: The attracting cycles, a tuple of `Cycle`, by their largest x1.
+        cycles: The attracting cycles, a tuple of `Cycle`, sorted by their largest x1.
         unstable: The unstable cycles, likewise.
-        separatrices: A tuple of `Separatrix`, by their points; the stable ones bound basins, as
-            unstable cycles do.
+        separatrices: A tuple of `Separatrix`, sorted by their points; the stable ones bound basins,
+            as unstable cycles do.
         escapes: Whether starts far out go to infinity.
-        reach: Bound of the search, `|x1|` and `|x2|` < reach. No cycle is farther out, as far as a
-            bound is known, which it is not where damping is 0. For damping < 0 with friction that
-            grows with the speed loops beyond were seen to grow, or shrink, as they do at infinity.
+        reach: Bound of the search, `|x1|` and `|x2|` < reach. No cycle is farther out where a bound
+            is known; for damping 0 none is. For damping < 0 with friction that grows with the
+            speed, the loops tried beyond it grew, or shrank, as they do at infinity.
         gaps: Intervals (from, to) of x1 at rest in which it is not known whether cycles pass,
             [gaps, 2]; also those of a continuum of closed orbits, which are neither attracting nor
             unstable; and (reach, inf) where there is a cycle farther out.
@@ -83,7 +83,7 @@ class Portrait(eqx.Module):
     def table(self) -> "pandas.DataFrame":
         """Returns a row for each equilibrium, cycle and separatrix.
 
-        Columns: what, number (among its sort), kind (an `EquilibriumKind`, the events of a cycle,
+        Columns: what, number (within its sort), kind (an `EquilibriumKind`, the events of a cycle,
         or where a separatrix leads to or comes from), stable, neutral (of an equilibrium; else
         False), x1_min, x1_max, x2_min, x2_max, period and multiplier of a cycle, rate of an
         equilibrium; NaN where it has none.
@@ -170,7 +170,8 @@ def portrait(osc: Oscillator) -> Portrait:
     Not for `jax.jit`, `jax.vmap` and derivatives: the numbers decide how much is computed.
 
     Args:
-        osc: A known `Oscillator`, with any friction laws, belts, contact intervals and damping.
+        osc: An `Oscillator` with known numbers (not traced), and any friction laws, belts, contact
+            intervals and damping.
 
     Returns:
         The `Portrait`.
@@ -188,7 +189,7 @@ def portrait(osc: Oscillator) -> Portrait:
 
 def _portrait(osc: OwnOscillator) -> Portrait:
     points = equilibria(osc)
-    # Its cycles are polished when the returns of orbits are known.
+    # Cycles are polished once the return map is known; the program for it is compiled meanwhile.
     loop, ok = blank_loop(SIZES[0], len(osc.belts)), jnp.asarray(Status.OK.value)
     with compiled_beside("portrait", osc, [lambda: polish(osc, loop, ok)]):
         found, map_ = branches_and_returns(osc, points)
@@ -227,7 +228,7 @@ def branches_and_returns(
 
 
 def _falls_short(one: Separatrix, reach: float) -> bool:
-    """Whether a separatrix ends before it comes to its origin or its destination."""
+    """Whether a separatrix was followed without reaching its origin or its destination."""
     is_inside = bool(jnp.max(jnp.abs(one.ys)) < reach)
     return one.end == "unsettled" or (one.end == "outside" and is_inside)
 
@@ -244,10 +245,11 @@ def _has_node_on_edge(osc: Oscillator, points: Equilibria) -> bool:
 def _named(
     branch: TracedSeparatrix, map_: Returns, points: Equilibria, cycles: Sequence[Cycle]
 ) -> Separatrix:
-    """The separatrix, with its destination or origin; cycles: possible ones."""
+    """The separatrix with its destination or origin; cycles: those that this may be."""
     end, to = _end_of(branch, map_, points, cycles)
     if branch.stable and end == "equilibrium" and points.stable[to]:
-        # Up to rounding no orbit comes from where all orbits nearby end; from a segment it may.
+        # Only by rounding does an orbit come from an equilibrium that attracts all orbits nearby;
+        # from a segment it may.
         if int(points.kind[to]) != EquilibriumKind.SEGMENT:
             end, to = "unsettled", -1
     ts, ys = jax.device_put((branch.ts, branch.ys))
@@ -272,7 +274,8 @@ def _approached(
 ) -> tuple[str, int]:
     """The limit of the tops of an orbit that was followed until they hardly moved.
 
-    It is the next such cycle in the direction in which the tops move, or the end of their interval.
+    It is the next of the `cycles` in the direction in which the tops move, or the end of their
+    interval.
     """
     if branch.status != Status.OK and (to := _creeping_to(branch, points)) >= 0:
         return "equilibrium", to
@@ -302,7 +305,7 @@ def _approached(
 def _creeping_to(branch: TracedSeparatrix, points: Equilibria) -> int:
     """Number of the point of rest that an orbit approaches for ever, or -1.
 
-    A node on an edge, or on the boundary of a belt at rest, takes for ever.
+    An orbit never arrives at a node on an edge, or on the boundary of a belt at rest.
     """
     ends = np.stack([np.asarray(points.x1_lower), np.asarray(points.x1_upper)])
     away = np.min(np.hypot(ends - branch.y[0], branch.y[1]), axis=0)

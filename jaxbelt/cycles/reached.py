@@ -1,7 +1,7 @@
 """The periodic motion to which a start of a forced oscillator leads: what `find_cycle` finds.
 
-An orbit is followed for many periods of the forcing. Where it is nearly back after some of them,
-`periodic` solves for a motion, which is the answer if it is stable and draws the orbit in.
+An orbit is followed for many periods of the forcing. Where its state nearly repeats after some of
+them, `periodic` solves for a motion, which is the answer if it is stable and attracts the orbit.
 """
 
 from collections.abc import Sequence
@@ -25,19 +25,19 @@ from .periodic import (
     solved_from,
 )
 
-#: Runs after which an orbit is given up that comes slowly near to a periodic motion, and one that
-#: does not.
+#: Number of runs after which the search ends for an orbit that slowly approaches a periodic motion,
+#: and for one that approaches none.
 MOST_SLOW, MOST_RESTLESS = 256, 32
-#: States after n periods that differ by less, relative to their size, may be one motion's; and by
-#: how much they have to be nearer to each other before they are tried again.
+#: Relative differences of states n periods apart: below NEARLY_BACK a periodic motion is tried at
+#: once, below HARDLY_BACK now and then; after a failure again where NEARER times the difference.
 NEARLY_BACK, HARDLY_BACK, NEARER = 1e-6, 1e-2, 0.1
-#: An orbit this near to a stable motion, relative to its size, comes to it; farther away it is
-#: asked, unless the eigenvectors of the motion are nearly parallel, by this condition number.
+#: An orbit within NEAR_MOTION of a stable motion, relative to its size, converges to it; farther
+#: away `_draws_in` decides, up to a condition number MOST_SKEW of the motion's eigenvectors.
 NEAR_MOTION, MOST_SKEW = 1e-5, 1e6
 
 
 def attracted(osc: Oscillator, y0: Any, turns: int) -> PeriodicMotion:
-    """The periodic motion that a start leads to, of a known oscillator in its own units."""
+    """The periodic motion that a start leads to, for a concrete oscillator in its own units."""
     y, due = np.asarray(y0, float), 1
     failed: dict[int, float] = {}
     for run in range(1, MOST_SLOW + 1):
@@ -46,7 +46,7 @@ def attracted(osc: Oscillator, y0: Any, turns: int) -> PeriodicMotion:
         if rests or len(followed.starts) <= PERIODS_AT_ONCE:
             return nothing_found(osc, turns, followed.status or Status.NOT_FINITE.value)
         nearly = _nearly_back(followed.starts)
-        # Slow approaches are tried now and then, and any other once it is nearer by far.
+        # Slow approaches are tried at runs 1, 2, 4, ...; close ones at once, then ten times closer.
         is_due = run == due
         due *= 1 + is_due
         for periods, away in nearly.items():
@@ -63,8 +63,8 @@ def attracted(osc: Oscillator, y0: Any, turns: int) -> PeriodicMotion:
 
 
 def _nearly_back(starts: np.ndarray) -> dict[int, float]:
-    """Numbers of periods after which an orbit is nearly back, ever nearer, and how far from there
-    it was, relative to its size; of these each is nearer than with fewer periods."""
+    """Numbers of periods after which the state nearly repeats, ever more closely, with its change
+    relative to the size of the orbit. A larger number has to halve the change, at least."""
     size = 1 + np.max(np.abs(starts))
     found, nearest = {}, HARDLY_BACK
     for periods in range(1, PERIODS_AT_ONCE // 2 + 1):
@@ -80,8 +80,8 @@ def _nearly_back(starts: np.ndarray) -> dict[int, float]:
 def _reached(
     osc: Oscillator, followed: Followed, periods: int, turns: int
 ) -> PeriodicMotion | None:
-    """The stable motion to which an orbit comes that is nearly back after some periods; or one of a
-    continuum, on which it is."""
+    """The stable motion to which an orbit leads that nearly repeats after these periods, or the
+    motion of a continuum on which the orbit is; None if there is neither."""
     motion = solved_from(osc, followed.last(periods).loop(), turns)
     if int(motion.status) == Status.NEUTRAL:
         return motion
@@ -93,11 +93,11 @@ def _reached(
 
 
 def _draws_in(osc: Oscillator, motion: PeriodicMotion, off: np.ndarray, turns: int) -> bool:
-    """Whether a stable motion draws in what is as far from it as a state that is off by that, [2].
+    """Whether a stable motion attracts the states as far from it as one that differs by `off`, [2].
 
     In the basis of the eigenvectors of its monodromy matrix a small difference turns and shrinks,
     or shrinks along each axis. So the way from that state to the motion stays in an ellipse, or in
-    a rectangle. Orbits from around its rim have to pass the events of the motion, and to shrink.
+    a rectangle. Orbits from its rim have to pass the events of the motion, and to approach it.
     """
     values, vectors = np.linalg.eig(np.asarray(monodromy_of(osc, motion.chain, motion.unknowns)))
     turning = np.iscomplexobj(values)
@@ -132,7 +132,7 @@ _RIM = np.array([[i, j] for i in (-1.0, 0.0, 1.0) for j in (-1.0, 0.0, 1.0) if (
 
 
 def motion_reached(osc: Oscillator, y0: Array) -> PeriodicMotion:
-    """What `find_cycle` returns of an oscillator with a clock."""
+    """What `find_cycle` returns for an oscillator with a clock."""
     require_outside_of_jit("find_cycle", IN_TRACES, osc=osc, y0=y0)
     return differentiable_motion(osc, y0, attracted)
 

@@ -6,10 +6,10 @@ a state (x1, 0) at which the mass is pulled to the left; the map leads from a to
 - A closed orbit has one top. Between a top and the next minimum of x1 an orbit is a graph over the
   x1 axis, and two orbits do not cross: were there two tops and two minima, two of the four arcs
   would. So the fixed points of the map are the cycles.
-- For the same reason the map does not decrease where both tops lie between the same neighbours of
-  the rests, edges and segments on the axis. So P(a) > b, or P(b) < a, shows that no cycle has its
-  top between a and b. The tops are divided until each interval is free in this sense, brackets a
-  change of sign of P(x1) - x1, or is short.
+- For the same reason the map P does not decrease between two tops a < b without a rest, an edge or
+  an end of a segment between them on the axis. So P(a) > b, or P(b) < a, shows that no cycle has
+  its top between a and b. The tops are divided until each interval is free in this sense, brackets
+  a change of sign of P(x1) - x1, or is short.
 - The map is flat where orbits stick, and steep beside. A cycle that sticks passes a place where a
   stick phase ends; the intervals are divided at the tops that follow these places, too.
 - It jumps at tops whose orbits end in a point of an edge that nothing draws in from one side, see
@@ -52,30 +52,30 @@ PER_DECADE = 16
 #: Intervals shorter than SHORT, as a fraction of the distance from where they begin, are divided
 #: only where the growth of loops changes by more than UNEVEN, and none below SHORTEST.
 SHORT, UNEVEN, SHORTEST = 1e-2, 0.05, 1e-5
-#: Smallest distance from the tops that follow stick phases, and jumps.
+#: Smallest distance of evaluated tops from those that follow stick phases, and from jumps.
 CLOSEST = 1e-10
 #: Smallest width of cycles around a pseudo-focus that are searched; their height is larger. For
-#: tops nearer to the edge rounding decides whether loops grow: they leave no gap.
+#: tops nearer to the edge rounding decides whether loops grow, so no gap is reported there.
 AT_FOCUS = 1e-7
 #: Distance at which both sides of a narrow gap are examined, over the distance from where its
 #: interval begins.
 AROUND = 0.3
 #: Largest number of tops in the search for all cycles.
 MOST_TOPS = 20_000
-#: Tops that return to themselves to this fraction do so up to the errors of orbits.
+#: A top returns to itself, up to the errors of orbits, if it changes by no more than this fraction.
 RETURNED = 1e-8
 #: A bracket is divided into 64, at most DIVISIONS times; if it then contains a jump, the map
 #: changes by more than JUMP there.
 DIVISIONS, JUMP = 6, 1e-6
 #: Where loops grow by less than HARDLY_GROWS the errors of the map are estimated from EACH_WAY tops
 #: on either side, which differ by the fraction SIDEWAYS: nearer to one another they have the same
-#: errors. Beside an edge these count up to UNRESOLVED, in units of 1 + |x1|.
+#: errors. Beside an edge such errors are considered up to UNRESOLVED, in units of 1 + |x1|.
 HARDLY_GROWS, EACH_WAY, SIDEWAYS, UNRESOLVED = 0.1, 8, 1e-2, 1e-4
-#: Values of a function within so many standard deviations of its errors are rounding.
+#: Values of a function within this many standard deviations of its errors are rounding.
 CERTAIN = 5.0
 #: Error of the map, relative to the top; a fixed point is off by this over 1 - multiplier.
 MAP_ERROR = 3e-7
-#: Cycles with a multiplier as near to 1 are parts of a continuum of closed orbits.
+#: Cycles with a multiplier this near to 1 are parts of a continuum of closed orbits.
 NEUTRAL = 1e-9
 #: Intervals of tops as short as this, relative to their place, are rounding.
 NARROWEST = 1e-12
@@ -83,7 +83,7 @@ NARROWEST = 1e-12
 ONE_TOP = 1e-11
 #: Largest distance from the origin that is searched, where no bound is known.
 FARTHEST = 1e4
-#: The growth of loops is as it is far out if it is off by less than this fraction.
+#: Loops grow as they do at infinity if their growth differs from that by less than this fraction.
 AS_EXPECTED = 0.25
 
 
@@ -96,10 +96,10 @@ class Bracket(NamedTuple):
 
 @jit
 def _next_tops(osc: Oscillator, starts: Array) -> tuple[Array, Loop]:
-    """The top that follows each start, [starts, 2], and the way there as if it were closed.
+    """x1 of the top that follows each start, [starts], and the orbit up to it as a loop.
 
-    In place of a top x1 where the orbit comes to rest; inf where it does not come back; NaN where
-    that is not known.
+    starts: states, [starts, 2]. In place of a top: x1 where the orbit comes to rest; inf where it
+    does not come back; NaN where that is not known.
     """
 
     def one(start):
@@ -121,9 +121,9 @@ def _stick_ends(osc: Oscillator) -> Array:
 
 
 class Returns:
-    """The return map of one oscillator, evaluated, and its fixed points.
+    """Values of the return map of one oscillator, and its fixed points.
 
-    reach: no cycle, and no orbit that comes to rest, has a top beyond it, or such are not known.
+    reach: bound of the tops of cycles and of orbits that come to rest, as far as one is known.
     intervals: of tops, (from, to) each, from left to right. cycles: all cycles found, each once, in
     order of their tops. gaps: intervals of tops, (from, to) each, in which it is not known whether
     there are cycles, such as a continuum of closed orbits. escapes: whether orbits from the
@@ -160,14 +160,14 @@ class Returns:
             self.gaps.append((outermost, np.inf))
 
     def __call__(self, tops: np.ndarray) -> np.ndarray:
-        """The tops that follow these: see `_next_tops`."""
+        """x1 of the tops that follow these tops, as of `_next_tops`."""
         new = np.array([top for top in tops.tolist() if top not in self._known])
         after, _ = self._after(self.osc, np.column_stack([new, np.zeros_like(new)]))
         self._known |= dict(zip(new.tolist(), after.tolist(), strict=True))
         return np.array([self._known[top] for top in tops.tolist()])
 
     def _after(self, osc: Oscillator, starts: np.ndarray) -> tuple[np.ndarray, list[Loop]]:
-        """The tops that follow these states, [starts, 2], and the loops, in batches of one size."""
+        """`_next_tops` of these states, [starts, 2]; the loops in batches of one size."""
         tops, loops = [np.zeros(0)], []
         for batch, some in in_batches(starts, np.arange(len(starts)), TOPS_AT_ONCE):
             after, ways = _next_tops(osc, some)
@@ -176,11 +176,11 @@ class Returns:
         return np.concatenate(tops), loops
 
     def _is_rounding(self, gap: tuple[float, float], rests: Equilibria) -> bool:
-        """Whether no cycle passes a gap: the map changes its sign there by rounding.
+        """Whether P(x1) - x1 changes its sign in a gap only by rounding, and no cycle passes there.
 
-        That is the case next to the edge from which an interval begins; at the edge where one ends;
-        nearer to a fixed point on an edge than loops that are known to grow as its rate says; and
-        where a gap is as narrow as rounding, but loops grow within it as they do outside.
+        That is the case next to an edge at which an interval begins; at an edge where one ends;
+        between a fixed point on an edge and loops that certainly grow, or shrink, as its rate says;
+        and where a gap is as narrow as rounding, but loops grow on its left as on its right.
         """
         (low, high), *_ = [*(i for i in self.intervals if i[0] <= gap[0] < i[1]), (np.nan, np.nan)]
         away, narrow = gap[1] - low, NARROWEST * (1 + abs(gap[1]))
@@ -195,7 +195,7 @@ class Returns:
         within, outside = self(beside) - beside
         here = np.asarray(rests.x1) == low
         if np.any(here & (np.asarray(rests.kind) == EquilibriumKind.PSEUDO_FOCUS)):
-            # That close to it the map is rounding, but its stability is known.
+            # That close to a pseudo-focus the map is rounding, but its stability is known.
             within = -1.0 if np.any(here & np.asarray(rests.stable)) else 1.0
         return bool(within * outside > 0)
 
@@ -203,7 +203,7 @@ class Returns:
         """Whether loops around a fixed point, at which an interval begins, grow or shrink as its
         rate says.
 
-        From a distance on; the first loops that are more than rounding decide.
+        Loops farther out than `away` are tried; the first whose growth exceeds rounding decides.
         """
         rate = _rate_at(rests, low)
         beyond = low + away * np.geomspace(1.0, 1e3, TOPS_AT_ONCE)[1:]
@@ -215,7 +215,7 @@ class Returns:
         return bool(known.size) and bool(rise[known[0]] * rate[0] > 0)
 
     def _errors_at(self, tops: np.ndarray, low: float) -> np.ndarray:
-        """Errors of the map, estimated from tops beside."""
+        """Errors of the map at these tops, estimated from tops beside them."""
         steps = SIDEWAYS * np.arange(-EACH_WAY, EACH_WAY + 1)
         beside = tops[:, None] + (tops[:, None] - low) * steps
         around = self(beside.ravel()).reshape(beside.shape) - beside
@@ -242,7 +242,7 @@ class Returns:
         return bool(left[0] < 0 and right[0] < 0)
 
     def _tops_after_sticking(self) -> list[float]:
-        """The tops after each place where a stick phase ends, and the ones after those."""
+        """The tops that follow places where stick phases end, and the tops that follow these."""
         starts = np.asarray(_stick_ends(self.osc))
         first, _ = self._after(self.osc, starts[np.isfinite(starts[:, 0])])
         tops = first[np.isfinite(first)]
@@ -263,7 +263,7 @@ class Returns:
             order = np.argsort(tops)
             tops, returns = tops[order], returns[order]
         self._collect(tops, returns, low)
-        # A cycle that is smaller than all of these.
+        # Where the smallest loop does not grow as the rate says, there is a smaller cycle.
         grows, rate = returns[0] - tops[0], _rate_at(rests, low)
         if np.any(grows * rate < 0):
             self.gaps.append((low, float(tops[0])))
@@ -275,7 +275,7 @@ class Returns:
         decades = np.log10(0.5 * length / least)
         away = np.geomspace(least, 0.5 * length, max(8, int(PER_DECADE * decades)))
         near = self._special[(low < self._special) & (self._special < high)]
-        # An unstable cycle may be as near to one that sticks as that is to its fold.
+        # An unstable cycle may be as near to a sticking cycle as this is to its fold.
         steps = np.geomspace(CLOSEST, 0.1, int(-0.25 * PER_DECADE * np.log10(CLOSEST)))
         beside = (near[:, None] + np.concatenate([-steps, steps])).ravel()
         tops = np.concatenate([low + away, high - away, [high], beside, near])
@@ -319,8 +319,8 @@ class Returns:
     def _with_rounding(
         self, tops: np.ndarray, rise: np.ndarray, zero: np.ndarray, low: float
     ) -> np.ndarray:
-        """Which rises of the map are zero, including those within its errors beside a change of
-        their sign.
+        """Mask of the rises of the map that are zero, including those within its errors beside a
+        change of sign.
 
         Near an edge that pushes the mass back these errors are large: x1 there is known to its
         rounding, and so x2 only to that rounding times the push, divided by x2.
@@ -356,7 +356,7 @@ class Returns:
         found: list[Cycle] = []
         for i, j, is_rounding in _changes_of_sign(rise):
             a, b, before, after = tops[i], tops[j], rise[i], rise[j]
-            # Where the map is flat, the cycle is where it leads.
+            # A secant step: where the map is flat, it leads to the top of the cycle.
             change = before - after
             share = before / change if np.isfinite(change) and change else 0.5
             at = a + (b - a) * np.clip(share, 0.01, 0.99)
@@ -374,7 +374,8 @@ class Returns:
         return found
 
     def _has_unstable(self, gap: tuple[float, float]) -> bool:
-        """Whether the map leaps over the diagonal there as it is steep at an unstable cycle."""
+        """Whether the map leaps over the diagonal in a gap because an unstable cycle makes it
+        steep."""
         tops = [float(cycle.x1_max) for cycle in self.cycles if float(cycle.multiplier) > 1]
         margin = MAP_ERROR * (1 + abs(gap[1]))
         return any(gap[0] - margin < top < gap[1] + margin for top in tops)
@@ -391,15 +392,16 @@ class Returns:
         return self._holds_by_more or bool(np.any(at))
 
     def _cycle_at(self, top: float, low: float, high: float) -> Cycle | None:
-        """The cycle with its top between two tops, from the loop of one between them, or None."""
+        """The cycle with its top between `low` and `high`, solved for from the loop that begins at
+        `top`; or None."""
         _, (loops,) = self._after(self.osc, np.array([[top, 0.0]]))
         return _if_at_home(solved(self.osc, pick(loops, 0)), top, high - low)
 
     def _cycle_behind(self, low: float, top: float) -> Cycle | None:
-        """The cycle with its top there, solved backwards, or None.
+        """The cycle with its top at `top`, solved for in reversed time, or None.
 
-        None means that the map jumps between low and there, or, where no top comes backwards, that
-        it is not known.
+        None means that the map jumps between `low` and `top`, or, where the reversed orbit comes to
+        no top, that this is not known: then the interval becomes a gap.
         """
         behind = reversed_in_time(self.osc)
         (before,), (loops,) = self._after(behind, np.array([[top, 0.0]]))
@@ -412,14 +414,14 @@ class Returns:
 
 
 def _rate_at(rests: Equilibria, x1: float) -> np.ndarray:
-    """The rate of the fixed point there; no number where there is none, or a neutral one."""
+    """The rate of the fixed point at x1, as an array; empty if there is none, or a neutral one."""
     near = np.abs(np.asarray(rests.x1) - x1) < NARROWEST * (1 + abs(x1))
     near &= np.asarray(rests.kind) == EquilibriumKind.FIXED_POINT
     return np.asarray(rests.rate)[near & ~np.asarray(rests.neutral)]
 
 
 def _if_at_home(cycle: Cycle, top: float, width: float) -> Cycle | None:
-    """A cycle that was solved for from a top, if it exists and is at the expected place."""
+    """A cycle that was solved for from `top`, or None where it does not exist or lies elsewhere."""
     if int(cycle.status) != Status.OK:
         return None
     x1, x2, _ = np.ptp(np.asarray(cycle.unknowns), axis=0)
@@ -431,7 +433,7 @@ def _if_at_home(cycle: Cycle, top: float, width: float) -> Cycle | None:
 
 
 def _touching_joined(gaps: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Intervals, with those as one that touch up to rounding."""
+    """Intervals, merged where they touch up to rounding."""
     joined: list[tuple[float, float]] = []
     for low, high in sorted(gaps):
         if joined and low - joined[-1][1] < NARROWEST * (1 + abs(low)):
@@ -443,9 +445,9 @@ def _touching_joined(gaps: Sequence[tuple[float, float]]) -> list[tuple[float, f
 def _with_tops_apart(cycles: Sequence[Cycle]) -> list[Cycle]:
     """Cycles in order of their tops, without those that rounding has multiplied.
 
-    Of several neighbours that all attract, or all do not, with one top up to rounding, the first is
-    kept: between two fixed points of that sort is another one. Where a saddle's orbit returns to
-    it, rounding of the map, which rises there like a square root, makes several of one.
+    Of several neighbours that all attract, or all do not, with equal tops up to rounding, the first
+    is kept: between two such fixed points lies one of the other sort. Where a saddle's orbit
+    returns to it, the map rises like a square root, and rounding makes several cycles of one.
     """
     kept = list(cycles[:1])
     for before, cycle in pairwise(cycles):
@@ -458,8 +460,8 @@ def _with_tops_apart(cycles: Sequence[Cycle]) -> list[Cycle]:
 
 
 def _changes_of_sign(rise: np.ndarray) -> list[tuple[int, int, bool]]:
-    """Changes of sign of a function between its values at even steps, and whether they are
-    rounding.
+    """Changes of sign of a function between its values at even steps, as numbers of both values,
+    and whether they are rounding.
 
     Neighbouring changes whose values are all rounding count as one.
     """
@@ -479,8 +481,8 @@ def _error_of(values: np.ndarray) -> float:
     """Standard deviation of errors in the values of a function at even steps.
 
     Zero for too few values; JUMP at most: larger values are no error. Little is left of a smooth
-    function in its fourth differences; the median of their sizes is 5.6 times that of independent
-    errors. A jump is in four of them.
+    function in its fourth differences; the median of their sizes is 5.6 times the standard
+    deviation of independent errors. A jump occurs in four of them.
     """
     left = np.abs(np.diff(values[np.isfinite(values)], 4))
     return min(float(np.median(left)) / 5.6, JUMP) if left.size > 2 * 4 else 0.0
@@ -523,7 +525,7 @@ def reach_of(osc: Oscillator) -> float:
 
 
 def _reach_of_friction_that_grows(osc: Oscillator, reach: float) -> float:
-    """The least of some tops beyond which loops grow, or shrink, as they do at infinity."""
+    """The least of the tried tops beyond which all loops grow, or shrink, as at infinity."""
     tops = np.geomspace(reach, FARTHEST, TOPS_AT_ONCE)
     after, _ = _next_tops(osc, jax.device_put(np.column_stack([tops, np.zeros_like(tops)])))
     growth = np.log(np.abs(after) / tops)

@@ -11,7 +11,7 @@ it.
 Where a segment ends elsewhere, at the limit of what belts at rest hold, orbits that stop within it
 stay, and those that stop beyond turn back. These are caught, too, if they stop near enough, unless
 friction falls so steeply that the end is an unstable node of the field in which they turn, or the
-static limit exceeds mu(0). Then the orbit that arrives in the end bounds the basin.
+static limit exceeds mu(0). Then the orbit that arrives at that end bounds the basin.
 
 Where the static limit of a belt exceeds mu(0) an orbit that touches its boundary separates those
 that pass by from those that stick, as these stick until the static limit. It ends in the point
@@ -67,12 +67,12 @@ from .shooting import flow, trace_of
 if TYPE_CHECKING:
     import pandas
 
-#: Arcs for which a separatrix is followed, some 40 loops; and a stable one that still grows then,
-#: as where damping is weak and loops pass many edges.
+#: Arcs for which a separatrix is followed, some 40 loops; and for a stable one whose loops still
+#: grow then, as where damping is weak and loops pass many edges.
 SEPARATRIX_ARCS, MORE_ARCS = 256, 2048
 #: Tops that move by less, relative to the distance from the origin, are converging.
 SETTLING = 1e-6
-#: Samples of each arc; steps of integration, of order 12, between them at most.
+#: Samples of each arc; largest number of integration steps, of order 12, in one arc.
 ARC_SAMPLES, STEPS_ALONG = 32, 100_000
 
 
@@ -96,9 +96,9 @@ class Separatrix(eqx.Module):
             too slowly).
         to: Number of that equilibrium, or of that attracting or unstable cycle, in the portrait;
             else -1.
-        arcs: The arcs as it was followed from its point; for a stable one backwards, in the
-            oscillator reversed in time. The end of the last arc, if it is not an event, is
-            "unused".
+        arcs: The arcs in the order in which they were followed from its point; for a stable one
+            those of the oscillator reversed in time. The end of the last arc, if it is not an
+            event, is "unused".
     """
 
     point: Array = eqx.field(metadata=quantity("length", "velocity"))
@@ -194,8 +194,8 @@ def _as_arrays(*numbers: float | int | bool) -> list[Array]:
 
 @jit
 def _orbits_part(osc: Oscillator, x1: Array) -> Array:
-    """Whether an edge, x1 [1], divides orbits: one side pushes away, the other one, too, or a belt
-    holds.
+    """Whether an edge, x1 [1], divides orbits: one side pushes the mass away, and the other one
+    does, too, or a belt holds the mass there.
 
     A fixed point that lies on the edge, up to rounding, does not divide them.
     """
@@ -209,7 +209,7 @@ def _orbits_part(osc: Oscillator, x1: Array) -> Array:
 
 @jit
 def _repels(osc: Oscillator, x1: Array, rightward: Array) -> Array:
-    """Whether orbits that turn just beyond an end of a segment leave it, to the side given."""
+    """Whether orbits that turn just beyond an end of a segment, on the given side, leave it."""
     zero = jnp.zeros(())
     mode = mode_onward(osc, x1, rightward)
     (trace,) = trace_of(osc, mode, x1, zero)
@@ -219,7 +219,7 @@ def _repels(osc: Oscillator, x1: Array, rightward: Array) -> Array:
 
 
 def mode_onward(osc: Oscillator, x1: Array, rightward: Array) -> Mode:
-    """The slip mode beside (x1, 0) to one side; a belt at rest opposes the motion to there."""
+    """The slip mode beside (x1, 0) on one side; a belt at rest opposes motion to that side."""
     sides = (contact_beside(osc, x1, jnp.zeros(()), rightward=side) for side in (True, False))
     mode = select(rightward, *sides)
     backward = jnp.where(rightward, -1.0, 1.0)
@@ -260,10 +260,10 @@ def corners(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
     """Points where a contact edge cuts off a piece of a belt's boundary that only static friction
     holds.
 
-    On that piece only a static limit that exceeds mu(0) holds the mass. One point where the mass
-    comes in for each zone between edges, [zones, 2], NaN where there is none; and the modes of the
-    orbits that come to them, [zones, belts]. On one side of such an orbit the mass is held, on the
-    other it slips away.
+    On that piece only a static limit that exceeds mu(0) holds the mass. Returns for each zone
+    between edges the point where the mass enters the piece, [zones, 2], NaN where there is none;
+    and the modes of the orbits that arrive there, [zones, belts]. On one side of such an orbit the
+    mass is held, on the other it slips away.
     """
     v = velocity_of(osc, belt) / osc.omega
     lower, upper = zone_ends(osc)
@@ -276,8 +276,8 @@ def corners(osc: Oscillator, belt: Array) -> tuple[Array, Array]:
     exists = exists & (upper - lower > force_rounding(x1))
     exists = exists & jnp.isfinite(x1) & (jnp.abs(pull) - kinetic > force_rounding(x1))
     exists = exists & (capacity(osc, inside) - jnp.abs(pull) > force_rounding(x1))
-    # It comes from the side to which the mass slips away; or, where it crosses there, from the
-    # other one.
+    # The orbit comes from the side to which the mass slips away; or, where it crosses the boundary
+    # there, from the other one.
     away = -jnp.sign(pull)
     modes = [before.slipping(sign) for sign in (away, -away)]
     comes = [
@@ -298,8 +298,8 @@ def _beside(osc: Oscillator, x1: Array, x2: Array, *, rightward: Array) -> Mode:
 def end_points(osc: Oscillator) -> Array:
     """All points in which separatrices may begin or end, [points, 2], NaN where there is none.
 
-    Those of contact edges, those of boundaries, and the ends of what can rest, which come last:
-    their number is not known under a trace.
+    First come the points on contact edges, then those on boundaries of belts, last the ends of
+    equilibria and segments, whose number is not known under a trace.
     """
     points = [
         ends_of(osc, *_as_arrays(belt))[0]
@@ -317,10 +317,10 @@ def end_points(osc: Oscillator) -> Array:
 def _at_rest(
     osc: Oscillator, x1: float, side: str, stable: bool, reach: float
 ) -> TracedSeparatrix | None:
-    """The separatrix of a point (x1, 0) on one side, if there is one."""
+    """The separatrix of a point (x1, 0) on one side of it, or None if there is none."""
     moving = reversed_in_time(osc) if stable else osc
     leaves, mode = map(np.asarray, _leaves(moving, *_as_arrays(x1, side == "right")))
-    # Backwards the signs of all relative velocities are the other ones.
+    # In reversed time all relative velocities have the opposite sign.
     mode = np.where(np.abs(mode) == 1, -mode, mode) if stable else mode
     return _branch(osc, (x1, 0.0), mode, side, stable, reach) if leaves else None
 
@@ -328,18 +328,18 @@ def _at_rest(
 def places_along(
     osc: Oscillator, codes: Array, y: Array, duration: Array, rate: Callable, marks: Array
 ) -> tuple[Array, Array]:
-    """Times since the entry of an arc, and states, [n] and [n, 2], at which an integral reaches
-    marks.
+    """Times since the entry of an arc, [n], and states, [n, 2], at which an integral over time
+    reaches marks.
 
-    rate: the integrand, a function of the state; marks: in order. Marks that are not reached are at
-    the end of the arc.
+    rate: the integrand, a function of the state; marks: increasing, [n]. For marks that are not
+    reached the end of the arc is returned.
     """
     mode = mode_of(codes)
 
     def to(carry, mark):
         def before(carry):
             _, left, total = carry
-            # Where there is no rate, NaN, the arc ends.
+            # Where the rate is NaN, the arc ends.
             return (left > 0) & ~(total >= mark)
 
         def step(carry):
@@ -364,8 +364,7 @@ def arc_samples(
     """Times and states of n samples of an arc, the last at its end.
 
     Three quarters of them are spread evenly along its way in the plane, the others evenly in time.
-    x1 and x2 are monotone, as extrema end arcs: |dx1| + |dx2| of the arc is the integral of that of
-    its steps.
+    The length of the way is |dx1| + |dx2| between the ends, as x1 and x2 are monotone along arcs.
     """
     mode = mode_of(codes)
     way = jnp.sum(jnp.abs(exit_ - y))
@@ -401,7 +400,7 @@ def _is_held(osc: Oscillator, ys: Array) -> Array:
 
 
 def _still_grows(orbit: Orbit) -> bool:
-    """Whether an orbit was left while its loops grew."""
+    """Whether the loops of an orbit still grew when its budget of arcs was used up."""
     tops = np.asarray(orbit.tops)[: int(orbit.count)]
     tops = tops[~np.isnan(tops)]
     is_left = int(orbit.status) == Status.NOT_SETTLED and tops.size > 1
@@ -443,10 +442,10 @@ def _branch(
     tops = orbit.tops[:count]
     if stable:
         ts, ys = -ts[::-1], ys[::-1]
-    # The last arc was left, unless it came to where the mass sticks.
+    # The last arc has no end event, unless it came to a boundary where the mass sticks.
     known = np.arange(count) < count - (not was_cut)
     ends = np.where(known, orbit.ends[:count], Ends(len(osc.belts)).unused)
-    # An arc that creeps is one, though it was followed in pieces.
+    # An arc that creeps was followed in pieces; these are one arc.
     whole = min(count, int(np.argmax(np.append(ends, -1) < 0)) + 1)
     durations = np.append(since[: whole - 1, -1], np.sum(since[whole - 1 : count, -1]))
     ends = np.where(ends < 0, Ends(len(osc.belts)).unused, ends)

@@ -5,9 +5,8 @@ A shock moves the state (x1, x2) of a mass that is on an attractor. It is fatal 
 goes elsewhere. The smallest fatal shock is the distance of the attractor from the boundary of its
 basin (L. Halekotte and U. Feudel, Minimal fatal shocks in multistable complex networks, Scientific
 Reports 10 (2020) 11783), which here is known exactly: it consists of unstable cycles and of stable
-separatrices. So the shock is known to the same digits, and its derivatives are known, too: where
-the way is shortest a change of its ends along the curves does not matter, only the change of the
-curves does.
+separatrices. So the shock is as accurate as these curves, and so are its derivatives: the shortest
+way does not change to first order where its ends move along the curves, only where the curves move.
 """
 
 from dataclasses import replace
@@ -42,7 +41,7 @@ if TYPE_CHECKING:
 
 #: Possible directions of a shock.
 DIRECTIONS = ("both", "x2")
-#: Statuses with which no number is known.
+#: Statuses with which every number is NaN.
 FAILED = (Status.NOT_SETTLED, Status.NO_CONVERGENCE)
 
 
@@ -58,14 +57,14 @@ class FatalShock(eqx.Module):
             portrait.
         boundary: Where the shock leads: "unstable cycle 0", "separatrix 3" (numbers in the
             portrait), "boundary of belt 0" (one whose static limit exceeds mu(0)), or "none".
-        beyond: Where starts lead on the other side of it: "cycle 1", "equilibrium 0", "infinity".
+        beyond: Where starts beyond that boundary lead: "cycle 1", "equilibrium 0", "infinity".
         distance: Size of the shock; inf where there is no boundary in that direction.
         start: State (x1, x2) on the attractor from which the shock is the smallest, [2]; NaN where
             there is no boundary.
         shock: Change of this state, [2], likewise.
-        status: OK; INCOMPLETE, where the portrait may lack boundaries, or they were not followed as
-            far as this; NOT_SETTLED, where y0 leads to no attractor, and NO_CONVERGENCE, where
-            Newton's method failed: then every number is NaN.
+        status: OK; INCOMPLETE, where the portrait may lack boundaries, or they were not followed
+            far enough to exclude a smaller shock; NOT_SETTLED, where y0 leads to no attractor, and
+            NO_CONVERGENCE, where Newton's method failed: then every number is NaN.
     """
 
     portrait: Portrait
@@ -125,7 +124,7 @@ class FatalShock(eqx.Module):
         }
         quantities = {"x1": "length", "x2": "velocity"}
         quantities |= {"shock_x1": "length", "shock_x2": "velocity"}
-        # One that combines displacement and velocity has no unit.
+        # A distance that combines displacement and velocity has no unit.
         quantities |= {"distance": "velocity"} if self.direction == "x2" else {}
         return table_of([row], quantities)
 
@@ -145,7 +144,7 @@ class FatalShock(eqx.Module):
             return f"FatalShock({self.attractor} to {self.boundary})"
         text = f"FatalShock({self.attractor}, {self.direction}: {number(self.distance)}"
         if self.boundary != "none":
-            # Beside the distance a component may be rounding.
+            # A component that is tiny compared with the distance may be rounding.
             shock = np.where(np.abs(self.shock) > 1e-15 * self.distance, self.shock, 0.0)
             start, shock = (", ".join(map(number, one)) for one in (self.start, shock))
             text += f", from ({start}) by ({shock}) to {self.boundary}, beyond it {self.beyond}"
@@ -169,7 +168,7 @@ def minimal_fatal_shock(
     computed, so not for `jax.jit` and `jax.vmap`.
 
     Args:
-        osc: The oscillator, or its `portrait`, where that is known.
+        osc: The oscillator, or its `portrait` where that has been computed.
         y0: Start (x1, x2) that leads to the attractor, a cycle, an equilibrium or a segment, shape
             [2].
         direction: "both", a change of x1 and x2, of size sqrt(dx1^2 + dx2^2), or "x2", of the
@@ -224,7 +223,7 @@ def _in_units_of(own_portrait: Portrait, own: OwnOscillator) -> Portrait:
 
 
 def length_of(shock: Array, direction: str) -> Array:
-    """The size of a shock in a direction."""
+    """The size of a shock, [2]; direction: see `minimal_fatal_shock`."""
     return jnp.abs(shock[1]) if direction == "x2" else jnp.sqrt(jnp.sum(shock**2))
 
 
@@ -233,7 +232,7 @@ def shortest_way_out(
 ) -> tuple[ShortestWay | None, Bound | None, Status]:
     """The shortest way from an attractor to the boundary of its basin, and that boundary.
 
-    None if there is none in that direction, or the status is one of FAILED.
+    Both are None if there is no boundary in that direction, or the status is one of FAILED.
     """
     if end.what not in ("cycle", "equilibrium"):
         return None, None, Status.NOT_SETTLED
@@ -249,7 +248,7 @@ def shortest_way_out(
             shortest, beside = length, bound
             way = ShortestWay(outline, bound.outline, meeting, along_x2)
     farthest = max(np.max(np.abs(ends)) for ends in (first.low, first.high))
-    # Beyond that separatrices are not followed.
+    # Separatrices are not followed beyond TRACED * reach.
     goes_on = any(one.stable and one.end == "outside" for one in own_portrait.separatrices)
     complete = not goes_on or shortest + farthest < TRACED * own_portrait.reach
     complete = complete and _is_complete(own_portrait, found)
@@ -259,7 +258,8 @@ def shortest_way_out(
 def _is_complete(own_portrait: Portrait, found: list[Bound]) -> bool:
     """Whether nothing is missing among the bounds of a portrait."""
     known = all(side.what != "undecided" for bound in found for side in bound.sides)
-    # One that ends on a boundary divides the pieces of it, and one of a belt at rest is a segment.
+    # A separatrix that ends on the boundary of a belt divides this into pieces; the boundary of a
+    # belt at rest is a segment.
     ends = ("unsettled", "boundary")
     traced = all(one.end not in ends for one in own_portrait.separatrices if one.stable)
     resting = {

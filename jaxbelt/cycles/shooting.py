@@ -52,10 +52,10 @@ from .chains import Chain, Loop
 
 #: Integration steps per slip arc (an arc is about a quarter of a loop at most).
 ARC_STEPS = 8
-#: Meshes of more steps than this are laid along a march of steps of this stride over the `density`,
-#: so many at most: those of other ones along even steps, of which some may jump a thin layer.
+#: Meshes of more than EVEN_STEPS steps are placed by a march of at most MESH_MARCH steps, each
+#: MESH_STRIDE over the `density`; others by even steps, some of which may jump a thin layer.
 EVEN_STEPS, MESH_STRIDE, MESH_MARCH = 32, 0.3, 20_000
-#: An arc magnifies if its end moves so much faster than its entry.
+#: An arc magnifies if the state moves this many times faster at its end than at its entry.
 MAGNIFIED = 1e4
 
 
@@ -65,9 +65,9 @@ _COARSE = scheme((2, 4))
 
 
 def arc_by_arc(function: Callable) -> Callable:
-    """What function(*shared, *row) gives of each arc of a chain, its rows, as a function of the
-    shared and of the columns, a tuple each. All arcs are one piece of machine code; in a batch, and
-    where they are too many, each of them is one, of all lanes."""
+    """Maps function(*shared, *row) over the arcs of a chain; returns call(shared, columns), whose
+    arguments are tuples. All arcs are one piece of machine code; in a batch, and where there are
+    too many arcs, each arc is one piece, for all lanes."""
     of_lanes = lanes_in_one_kernel(one_kernel(function))
 
     @functools.wraps(function)
@@ -107,8 +107,8 @@ def meshed(osc: Oscillator, loop: Loop, steps: int = ARC_STEPS) -> tuple[Chain, 
 
 @functools.cache
 def _meshes(steps: int) -> Callable:
-    """`_mesh` of all arcs. Not by `arc_by_arc`: in a batch a whole march is too large for a piece,
-    so each step of it is one."""
+    """`_mesh` of all arcs. Not by `arc_by_arc`: in a batch a whole march is too large for one piece
+    of machine code, so each step of the march is a piece."""
 
     @one_kernel_alone
     def call(osc, columns):
@@ -137,7 +137,7 @@ def densities(
 ) -> Array:
     """The density of steps at the ends of n coarse steps along an arc that slips, [n + 1].
 
-    Clipped: where a guess is poor the mesh is only less good.
+    It is clipped, so that a poor guess only makes the mesh less good.
     """
 
     def march():
@@ -152,11 +152,11 @@ def densities(
 
 
 def _marched_mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration: Array) -> Array:
-    """The same, by as many steps along the arc as its density wants."""
+    """`_mesh` by a march along the arc, whose steps follow the density."""
     even = jnp.linspace(0.0, 1.0, steps + 1)
 
     def march(total):
-        """The share of the whole duration; and the times of even shares of `total`."""
+        """The integral of the density over the arc, and the times of even fractions of `total`."""
 
         def unfinished(carry):
             number, _, _, left, _, _ = carry
@@ -164,7 +164,7 @@ def _marched_mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration:
 
         def advance(carry):
             number, y, rho, left, share, grid = carry
-            # The last step that there is room for goes to the end.
+            # The last step within MESH_MARCH goes to the end of the arc.
             wanted = jnp.where(number < MESH_MARCH - 1, MESH_STRIDE / rho, left)
             h = jnp.minimum(wanted, left)
             y, after = coarse_step(osc, codes, y, h)
@@ -180,7 +180,7 @@ def _marched_mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration:
         *_, share, grid = lax.while_loop(unfinished, advance, start)
         return share, grid
 
-    # Stick phases, and what pads a chain, take no steps.
+    # Stick phases, and the padding of a chain, take no steps. First march: the total density.
     _, grid = march(march(jnp.ones(()))[0])
     grid = grid.at[-1].set(duration) / jnp.where(duration == 0, 1.0, duration)
     return jnp.diff(jnp.where(duration == 0, even, grid))
@@ -188,7 +188,7 @@ def _marched_mesh(osc: Oscillator, steps: int, codes: Array, y: Array, duration:
 
 @lanes_in_one_kernel
 def coarse_step(osc: Oscillator, codes: Array, y: Array, h: Array) -> tuple[Array, Array]:
-    """The state after a step, and the density of steps that is wanted there."""
+    """The state after a step of length h, and the density of steps that is needed there."""
     y = arc_step(functools.partial(slip_slopes, osc, codes), y, h, _COARSE)
     return y, density(osc, mode_of(codes), *y)
 
@@ -199,8 +199,8 @@ def over_mesh(
     mesh: Array,
     seen: Callable[[Any], Any] = lambda state: None,
 ) -> tuple[Any, Any]:
-    """What advance(state, fraction) makes of a state, step by step of a mesh, [steps]; and what is
-    seen of the state after each step, [steps, ...].
+    """The last state of advance(state, fraction), applied to each step of a mesh, [steps]; and
+    seen(state) after each step, [steps, ...].
 
     Padding of a long mesh, steps of length zero at its end, is skipped.
     """
@@ -226,8 +226,8 @@ def over_mesh(
 def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, extra=None):
     """End of one arc, (x1, x2), and the integrals of `extra(osc, mode, x1, x2)`, a vector, over it.
 
-    A stick arc is a straight line; Simpson's rule is exact there for what is at most cubic. With a
-    clock states are (x1, x2, t), and the integrals are those of slip arcs, 0 of stick arcs.
+    A stick arc is a straight line; Simpson's rule is exact there for integrands that are at most
+    cubic. With a clock states are (x1, x2, t), and the integrals over stick arcs are given as 0.
     """
     mode = mode_of(codes)
     stuck = mode.any_stuck
@@ -264,7 +264,7 @@ def flow(osc: Oscillator, codes: Array, mesh: Array, y: Array, duration: Array, 
 
 
 def end_guard(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
-    """What vanishes at y if an arc ends there by `end`; zero for an unused one."""
+    """The guard that vanishes at y if an arc ends there by `end`; zero for an unused arc."""
     if has_clock(osc):
         return _timed_end_guard(osc, codes, end, y)
     mode = mode_of(codes)
@@ -279,7 +279,7 @@ def end_guard(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
 
 
 def _timed_end_guard(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
-    """`end_guard` with a clock, but for the end of a period."""
+    """`end_guard` with a clock, except for the end of a period."""
     mode, state = mode_of(codes), (y[0], y[1], y[2])
 
     def guards(*y):
@@ -301,7 +301,7 @@ def _timed_end_guard(osc: Oscillator, codes: Array, end: Array, y: Array) -> Arr
 
 
 def late_at_end(osc: Oscillator, codes: Array, end: Array, y: Array) -> Array:
-    """`late_contacts` at the end y of an arc, 0 where that is no edge."""
+    """`late_contacts` at the end y of an arc, 0 where it does not end at a contact edge."""
     mode, n = mode_of(codes), len(osc.belts)
     if not has_edges(osc):
         return jnp.zeros(())
@@ -317,11 +317,11 @@ def trace_of(osc: Oscillator, mode: Mode, x1: Array, x2: Array) -> Array:
 
 
 def magnifies(osc: Oscillator, codes: Array, entry: Array, exit_: Array) -> Array:
-    """Whether an arc leads away from a place where the orbit hardly moves, and lingers.
+    """Whether an arc leads away from a place where the orbit lingers and hardly moves.
 
-    Such is a mass that a slow belt leaves: its end is lost in the rounding of its beginning,
-    magnified by the ratio of the two velocities in the plane. Backwards this is the ratio over the
-    growth of areas, so the arc is followed backwards where areas grow.
+    An example is a mass that leaves a slow belt: the end of the arc is lost in the rounding of its
+    entry, magnified by the ratio of the two speeds in the phase plane. Backwards the magnification
+    is that ratio over the growth of areas, so arcs are followed backwards where areas grow.
     """
     osc, entry, exit_ = lax.stop_gradient((osc, entry, exit_))
     mode = mode_of(codes)
@@ -331,7 +331,7 @@ def magnifies(osc: Oscillator, codes: Array, entry: Array, exit_: Array) -> Arra
 
 
 def _magnifying(osc: Oscillator, chain: Chain, z: Array) -> Array:
-    """Which of the arcs, [N], magnify an error at their entry; see `magnifies`."""
+    """Mask [N] of the arcs that magnify an error at their entry; see `magnifies`."""
     exits = jnp.roll(z[:, :2], -1, axis=0)
     return jax.vmap(functools.partial(magnifies, osc))(chain.codes, z[:, :2], exits)
 
@@ -339,12 +339,12 @@ def _magnifying(osc: Oscillator, chain: Chain, z: Array) -> Array:
 def _arc_equations(osc: Oscillator, codes, end, mesh, backwards, unknown: Array) -> Array:
     """(x1, x2, guard, 0) at the end of one arc, from its unknowns (x1, x2, T).
 
-    Backwards: (x1, x2) are the state in which it ends; of the four numbers the first two are its
-    entry. An unused arc ends as it begins, and its guard is its duration. An arc that has to end
-    tangent to the boundary of a belt ends at the point of it with x2' = 0. Trial arcs that run past
-    there meet the pole of the friction law, so this arc is followed backwards, from that point to
-    its beginning: (x1, x2) are the point's, the last two numbers the misses of x1 and of x2. That
-    is one more equation, a condition on the oscillator.
+    backwards: the unknown (x1, x2) is the state in which the arc ends, and the first two numbers
+    are its entry. An unused arc ends as it begins, and its guard is its duration. An arc that has
+    to end tangent to the boundary of a belt ends at the point of the boundary with x2' = 0. Trial
+    arcs that run past that point meet the pole of the friction law, so this arc is followed
+    backwards from the point to its entry: the first two numbers are the point, the last two the
+    errors in the entry's x1 and x2. That is one more equation, a condition on the oscillator.
     """
     is_unused = end == Ends(len(osc.belts)).unused
 
@@ -359,7 +359,7 @@ def _arc_equations(osc: Oscillator, codes, end, mesh, backwards, unknown: Array)
 
 
 def _followed(osc: Oscillator, codes, end, mesh, backwards, unknown: Array) -> Array:
-    """`_arc_equations` of an arc that is used."""
+    """`_arc_equations` of a used arc."""
     names = Ends(len(osc.belts))
     is_tangent = end >= names.tangent
     velocity = jnp.zeros(())
@@ -403,8 +403,8 @@ def with_columns(
 ) -> tuple[Array, Array]:
     """A function of an oscillator and n unknowns, and its derivatives, in a last axis of n + k.
 
-    By the unknowns, and along the k directions `along` in the space of oscillators (an oscillator
-    of arrays [k, ..]; None: none).
+    They are taken by the unknowns, and along the k directions `along` in the space of oscillators
+    (an oscillator of arrays [k, ..]; None: no directions).
     """
     n, more = unknowns.size, 0 if along is None else jax.tree.leaves(along)[0].size
 
@@ -423,8 +423,8 @@ def _weighted(weights: Array, slopes: Array) -> Array:
 
 
 def directions_of(osc: Oscillator, tangents: Oscillator) -> tuple[Oscillator, Array]:
-    """A direction for each number of the oscillator that has a tangent, as an oscillator of arrays
-    [k, ..], and these tangents, [k]."""
+    """A unit direction for each of the k numbers of the oscillator that have a tangent, as an
+    oscillator of arrays [k, ..], and these tangents, [k]."""
     moving, fixed = moving_and_fixed(osc, tangents)
     numbers, unravel = jax.flatten_util.ravel_pytree(moving)
     steady = jax.tree.map(jnp.zeros_like, fixed)
@@ -435,7 +435,7 @@ def directions_of(osc: Oscillator, tangents: Oscillator) -> tuple[Oscillator, Ar
 
 
 def arc_columns(chain: Chain, *others: Array) -> tuple[Array, ...]:
-    """The columns of a chain, and others, for what is done arc by arc."""
+    """The columns of a chain, and others, as functions made by `arc_by_arc` take them."""
     return chain.codes, chain.ends, chain.mesh, *others
 
 
@@ -443,7 +443,7 @@ def arc_columns(chain: Chain, *others: Array) -> tuple[Array, ...]:
 def _by_columns(osc: Oscillator, chain: Chain, backwards: Array, z: Array) -> Array:
     """`_all_arc_equations`, with derivatives by columns, arc by arc.
 
-    Reverse mode through all steps takes ten times as long.
+    Reverse mode through all integration steps takes ten times as long.
     """
     return _all_arc_equations((osc,), arc_columns(chain, backwards, z))
 
@@ -462,9 +462,9 @@ def _(primals, tangents):
 def residual(
     osc: Oscillator, chain: Chain, z: Array, backwards: Array | None = None
 ) -> tuple[Array, Array]:
-    """The 3N equations at the unknowns z, [N, 3], and the miss of the tangent arcs.
+    """The 3N equations at the unknowns z, [N, 3], and the error in the condition of tangent arcs.
 
-    Mismatch of x1, of x2, guard, for every arc; the miss is zero where there is no tangent arc.
+    For every arc: mismatch of x1, of x2, and guard. Without tangent arcs the error is zero.
     backwards: arcs that are followed backwards, [N]; default none.
     """
     backwards = _none(z) if backwards is None else backwards
@@ -492,8 +492,8 @@ def residual_and_blocks(
     """`residual`, and its derivatives, [N, 4, 3 + k].
 
     The derivatives of the equations of each arc with respect to its (x1, x2, T), and along the k
-    directions `along` in the space of oscillators, if these are given (an oscillator of arrays
-    [k]).
+    directions `along` in the space of oscillators (an oscillator of arrays [k, ..]; None: no
+    directions).
     """
     backwards = _none(z) if backwards is None else backwards
     out, blocks = _equations_and_blocks((osc, along), arc_columns(chain, backwards, z))
@@ -501,8 +501,9 @@ def residual_and_blocks(
 
 
 def jacobian(blocks: Array, backwards: Array | None = None) -> Array:
-    """The 3N x 3N matrix of the system: the slopes of each arc's end and guard, and minus those of
-    the next arc's entry, of which one is its unknown."""
+    """The 3N x 3N matrix of the system: derivatives of each arc's end and guard, minus those of the
+    next arc's entry. The end is an unknown itself where an arc is followed backwards, else the
+    entry is."""
     n, unknowns = blocks.shape[0], blocks.shape[-1]
     own, entry = blocks, jnp.asarray(np.diag([1.0] * (unknowns - 1) + [0.0]))[None]
     if backwards is not None:
@@ -543,11 +544,11 @@ def solve_closed(osc: Oscillator, chain: Chain, guess: Array) -> tuple[Array, Ar
     """The unknowns of a closed chain near a guess, [N, 3], differentiable with respect to the
     oscillator.
 
-    Also returns the number of Newton steps, and the possible error of the states, by the last steps
-    and by rounding: none in a chain that sticks, which begins at slip onset, known from the
-    parameters (durations that wander do not move it). An arc that magnifies is followed backwards
-    from the state in which it ends, which is then its unknown: forwards its rounding would be
-    larger than the tolerance of the equations.
+    Also returns the number of Newton steps, and the possible error of the states, from the last
+    steps and from rounding. It is 0 for a chain that sticks: that begins at slip onset, which the
+    parameters alone determine (durations that wander do not move it). An arc that magnifies is
+    followed backwards from the state in which it ends, which is then its unknown: forwards its
+    rounding would be larger than the tolerance of the equations.
     """
     guess = lax.stop_gradient(guess)
     backwards = _magnifying(osc, chain, guess)
@@ -559,8 +560,7 @@ def solve_closed(osc: Oscillator, chain: Chain, guess: Array) -> tuple[Array, Ar
 
 
 def closed(osc: Oscillator, chain: Chain, z: Array) -> Array:
-    """The unknowns z that `solve_closed` has found, differentiable with respect to the
-    oscillator."""
+    """The unknowns z found by `solve_closed`, differentiable with respect to the oscillator."""
     z = lax.stop_gradient(z)
     backwards = _magnifying(osc, chain, z)
     solved = solution(ClosedChain(chain, backwards), osc, _with_ends(backwards, z))
@@ -568,12 +568,13 @@ def closed(osc: Oscillator, chain: Chain, z: Array) -> Array:
 
 
 def _with_ends(backwards: Array, z: Array) -> Array:
-    """The entries, or for arcs that are followed backwards the states in which they end."""
+    """z with the entries of arcs that are followed backwards replaced by the states at their
+    ends."""
     return jnp.where(_is_end(backwards), jnp.roll(z, -1, axis=0), z)
 
 
 def _with_entries(osc: Oscillator, chain: Chain, backwards: Array, z: Array) -> Array:
-    """The inverse of `_with_ends`, by following these arcs."""
+    """The inverse of `_with_ends`, by following these arcs backwards to their entries."""
 
     def entered():
         return jnp.where(_is_end(backwards), _by_columns(osc, chain, backwards, z)[:, :3], z)

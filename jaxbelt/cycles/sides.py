@@ -23,12 +23,12 @@ from .orbits import MOST_ARCS, follow, place_of_rest
 from .outlines import ClosedOutline, OpenOutline, Outline, StraightOutline, jumps, place_on
 from .portrait import Portrait
 
-#: Starts that are followed in one batch, and number of rounds, MOST_ARCS arcs each.
+#: Starts that are followed in one batch; largest number of rounds of MOST_ARCS arcs each.
 STARTS_AT_ONCE, ROUNDS = 16, 32
 #: Accuracy of x2 of places on the axis; states at ends of arcs are good to 1e-9.
 ON_AXIS = 1e-8
-#: A cycle that attracts weakly is recognised from so far off, relative to the distance from the
-#: origin.
+#: Distance, relative to that from the origin, at which an orbit is assigned to a cycle, which may
+#: attract weakly, or to a place of rest.
 KNOWN = 1e-3
 #: Distance of starts from a curve that does not cross the axis, and from a boundary.
 ASIDE = 1e-6
@@ -66,12 +66,12 @@ class Bound(NamedTuple):
     sides: tuple[Destination, Destination]
 
     def beyond(self, end: Destination) -> Destination:
-        """The other side."""
+        """The destination on the side of the curve that does not lead to `end`."""
         return self.sides[1] if self.sides[0] == end else self.sides[0]
 
 
 def bounds_of(portrait: Portrait) -> list[Bound]:
-    """All curves of a portrait that divide motions with different ends, or may do so."""
+    """All curves of a portrait that divide, or may divide, motions with different destinations."""
     osc, places = portrait.oscillator, _places(portrait)
     found: list[tuple[str, Outline, np.ndarray]] = []
     for number, cycle in enumerate(portrait.unstable):
@@ -110,7 +110,7 @@ def _places(portrait: Portrait) -> np.ndarray:
 
 
 def _around(places: np.ndarray, x1: float) -> np.ndarray:
-    """Starts on the axis on both sides of a place, half the way to the next one, [2, 2]."""
+    """Starts on the axis on both sides of a place, half the way to the next places, [2, 2]."""
     # Places that differ by rounding are one.
     near = 10 * ON_AXIS * (1 + abs(x1))
     left = places[places < x1 - near].max(initial=-np.inf)
@@ -121,7 +121,7 @@ def _around(places: np.ndarray, x1: float) -> np.ndarray:
 
 
 def _across(osc: Oscillator, outline: Outline) -> np.ndarray:
-    """Starts on both sides of the middle of the first piece, [2, 2]."""
+    """Starts on both sides of the middle of an outline's first piece, [2, 2]."""
     piece = jax.tree.map(lambda leaf: leaf[0], outline.pieces(osc))
     place, slope, _ = map(np.asarray, place_on(osc, piece, jnp.asarray(0.5)))
     normal = np.array([-slope[1], slope[0]]) / np.hypot(*slope)
@@ -163,7 +163,7 @@ def _followed_on(osc: Oscillator, starts: Array):
 def _destination(
     portrait: Portrait, status: int, top: float, rest: float, y: np.ndarray
 ) -> Destination | None:
-    """Where an orbit has come to; None if that is not known yet."""
+    """The destination of an orbit; None if it has to be followed on."""
     if not np.isnan(rest):
         return _resting_at(portrait, rest)
     if status == Status.OK:
@@ -188,7 +188,7 @@ def _resting_at(portrait: Portrait, x1: float) -> Destination:
 
 
 def segments_of(portrait: Portrait) -> list[tuple[int, int]]:
-    """Rows of the first and the last piece of each point, or segment, where the mass can rest."""
+    """Rows in `equilibria` of the first and last piece of each point or segment of rest."""
     rests = portrait.equilibria
     kinds, lower, upper = map(np.asarray, (rests.kind, rests.x1_lower, rests.x1_upper))
     held = (kinds[1:] == EquilibriumKind.SEGMENT) & (kinds[:-1] == EquilibriumKind.SEGMENT)

@@ -3,9 +3,8 @@
 Starts to the right of the equilibrium at different distances are followed for one loop. The first
 one that does not come nearer, or that touches a boundary, lies outside of the cycle; between it and
 its neighbour the search is repeated, and Newton's method does the rest. That is one program, for
-`jit`, `vmap` and derivatives. It passes over a cycle with another one that attracts close outside
-of it. So where it finds none, and the oscillator is known, all cycles are searched, as by
-`portrait`.
+`jit`, `vmap` and derivatives. It misses a cycle that has an attracting one close outside of it. So
+where it finds none, and the oscillator is not traced, all cycles are searched, as by `portrait`.
 """
 
 import functools
@@ -79,7 +78,8 @@ def from_starts(osc: Oscillator, *, around: int = 0, room: int = SIZES[0]) -> Cy
 
 
 def among_all(osc: Oscillator, around: int) -> Cycle | None:
-    """The innermost such cycle around an equilibrium, among all cycles of a known oscillator."""
+    """The innermost cycle of that sort around an equilibrium, among all cycles of a concrete
+    oscillator; None if there is none."""
     points = equilibria(osc)
     meant = np.flatnonzero(_eligible(points))
     if around >= len(meant):
@@ -95,7 +95,7 @@ def _eligible(rests: Equilibria) -> Array:
 
 
 def _is_sought(cycle: Cycle, x1: float) -> bool:
-    """Whether it repels, sticks to nothing and goes around a place."""
+    """Whether a cycle repels, never sticks, and surrounds the place x1."""
     slips = not np.any(modes_of(arcs_of(cycle)[0]) == STUCK)
     low, high, *_ = place_of(cycle)
     return float(cycle.multiplier) > 1 and slips and bool(low < x1 < high)
@@ -142,8 +142,8 @@ def _separating_in_lanes(still: Oscillator, rests: Equilibria, around: Array, si
 
 @jit
 def _if_meant(cycle: Cycle, loop: Loop, distance: Array) -> Cycle:
-    """The cycle, if it repels and begins near the loop; one found elsewhere by Newton's method, or
-    that has shrunk to the equilibrium, is not the one meant."""
+    """The cycle if it repels and begins near the loop, else NaN with NO_UNSTABLE_CYCLE: Newton's
+    method may find one elsewhere, or shrink it to the equilibrium."""
     near = jnp.abs(cycle.unknowns[0, 0] - loop.entries[0, 0]) < 0.1 * distance
     same = near & (cycle.multiplier > 1)
     missing = (cycle.status == Status.OK) & ~same | (cycle.status == Status.NOT_ADMISSIBLE)
