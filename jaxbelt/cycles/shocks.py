@@ -85,7 +85,8 @@ class FatalShock(eqx.Module):
 
         Returns:
             A row for each phase, with the columns t, the time since the first phase, x1, x2,
-            distance, shock_x1, shock_x2; inf and NaN where there is no boundary in that direction.
+            distance, shock_x1, shock_x2; inf and NaN where there is no boundary in that direction,
+            NaN where Newton's method failed.
         """
         known, along_x2 = in_units_of_run(self.portrait.oscillator), self.direction == "x2"
         shown, unit = _in_units_of(self.portrait, known), float(known.units.length)
@@ -100,6 +101,9 @@ class FatalShock(eqx.Module):
             ways = [shortest_between(known, point, curve, along_x2=along_x2) for curve in curves]
             best, to = np.inf, np.full(2, np.nan)
             for length, its_end, meeting in ways:
+                if np.isnan(length):
+                    best, to = np.nan, np.full(2, np.nan)
+                    break
                 if meeting is not None and length < best:
                     best, to = length, its_end
             rows.append([t, *(unit * np.array([*y, best, *(to - y)])).tolist()])

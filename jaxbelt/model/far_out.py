@@ -1,7 +1,8 @@
 """Loops far out, of large amplitude: whether they grow or shrink.
 
 From a loop of large amplitude A, nearly a circle, viscous damping takes the energy pi zeta A^2, and
-dry friction, which opposes motion, takes a further D(A) > 0. Loops far out shrink where
+dry friction a further D(A); a law that falls below zero gives energy, D(A) < 0. Loops far out
+shrink where
 
     zeta + lim D(A) / (pi A^2) > 0
 
@@ -9,7 +10,7 @@ and grow where this sum is negative.
 
 The limit is 0 for friction that is bounded. Where mu(r) grows as p2 r^2 it is 2/pi u0 p2 omega^2
 for each unit of length of the contact interval, if this is finite; otherwise D(A) grows as A^3,
-and no loop far out grows. Where mu(r) grows as c r it is u0 c omega for contact everywhere, half of
+and its sign decides. Where mu(r) grows as c r it is u0 c omega for contact everywhere, half of
 that for contact to one side.
 """
 
@@ -28,7 +29,7 @@ LEAST_LINEAR, LEAST_QUADRATIC = 1e-7, 1e-13
 
 def contraction_far_out(osc: Oscillator) -> Array:
     """The sum above, as a damping: positive where loops far out shrink, negative where they grow,
-    inf where D(A) grows as A^3."""
+    inf or -inf where D(A) grows as A^3."""
     contraction = osc.damping
     for belt in osc.belts:
         linear, quadratic = _growth(belt.friction)
@@ -36,8 +37,9 @@ def contraction_far_out(osc: Oscillator) -> Array:
         sides = sum(jnp.where(jnp.isinf(end), 0.5, 0.0) for end in (belt.lower, belt.upper))
         finite = jnp.where(jnp.isfinite(length), length, 0.0)
         taken = osc.omega * linear * sides + 2 / jnp.pi * osc.omega**2 * quadratic * finite
-        unbounded = (sides > 0) & (belt.load * quadratic > 0)
-        contraction = contraction + jnp.where(unbounded, jnp.inf, belt.load * taken)
+        unbounded = jnp.where(sides > 0, belt.load * quadratic, 0.0)
+        limitless = jnp.sign(unbounded) * jnp.inf
+        contraction = contraction + jnp.where(unbounded != 0, limitless, belt.load * taken)
     return contraction
 
 
@@ -48,14 +50,15 @@ def _growth(law: AbstractFriction, r: float = FAST[1]) -> tuple[Array, Array]:
     linear = (-2.5 * once + 4 * twice - 1.5 * thrice) / r
     rounding = 1e-14 * jnp.abs(quadratic) * r
     none = jnp.zeros_like(once)
-    linear = jnp.where(linear > LEAST_LINEAR + rounding, linear, none)
-    return linear, jnp.where(quadratic > LEAST_QUADRATIC, quadratic, none)
+    linear = jnp.where(jnp.abs(linear) > LEAST_LINEAR + rounding, linear, none)
+    return linear, jnp.where(jnp.abs(quadratic) > LEAST_QUADRATIC, quadratic, none)
 
 
 def has_limit(law: AbstractFriction) -> Array:
     """Whether the growth of a law is the same at both speeds `FAST`; a square root's is not."""
     pairs = zip(*(_growth(law, r) for r in FAST), strict=True)
-    return jnp.all(jnp.stack([jnp.abs(a - b) <= 1e-4 * (a + b) for a, b in pairs]))
+    close = [jnp.abs(a - b) <= 1e-4 * jnp.maximum(jnp.abs(a), jnp.abs(b)) for a, b in pairs]
+    return jnp.all(jnp.stack(close))
 
 
 @jit

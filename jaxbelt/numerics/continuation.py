@@ -103,6 +103,9 @@ def continue_curve(
         leaves = np.any(new.u < limits[0]) or np.any(new.u > limits[1])
         if leaves:
             new = _at_limit(solve, point, new, limits)
+            if new is None:
+                yield point._replace(end=Stop.STEP_TOO_SMALL)
+                return
         # A point that lies on the side already is the last one; it is not repeated.
         if not leaves or np.max(np.abs(new.u - point.u)) > SMALLEST_CORRECTION:
             yield point
@@ -133,8 +136,9 @@ def _next_point(solve, point: CurvePoint, step: float, steps) -> tuple[CurvePoin
     return None, step
 
 
-def _at_limit(solve, point: CurvePoint, beyond: CurvePoint, limits) -> CurvePoint:
-    """The point where the curve meets the first side of the span, from `point` to `beyond`."""
+def _at_limit(solve, point: CurvePoint, beyond: CurvePoint, limits) -> CurvePoint | None:
+    """The point where the curve meets the first side of the span, from `point` to `beyond`; None
+    where Newton's method fails."""
     # Newton's method in the plane of that side: its normal is along a coordinate.
     change, short, far = beyond.u - point.u, beyond.u < limits[0], beyond.u > limits[1]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -146,7 +150,7 @@ def _at_limit(solve, point: CurvePoint, beyond: CurvePoint, limits) -> CurvePoin
     normal = np.zeros_like(guess)
     normal[axis] = np.sign(change[axis])
     solved = solve(guess, normal, 0.0)
-    return _point(solved if solved.found else solved._replace(u=guess))
+    return _point(solved) if solved.found else None
 
 
 class Corrected(NamedTuple):
