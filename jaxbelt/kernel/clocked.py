@@ -362,7 +362,7 @@ def _meetings(
     no = none > 0
     limit = where_any(
         stuck,
-        lambda: _limit_of_stick(osc, clock, window, lanes, new, room, reach, lands),
+        lambda: _limit_of_stick(osc, clock, lanes, new, room, reach, lands),
         _GuardMeeting(no, no, none + 1, none + NEVER, jnp.full_like(lanes.hit, 3 * n)),
     )
     asked = stuck & (lanes.status != Status.STUCK_FOREVER.value)
@@ -372,7 +372,7 @@ def _meetings(
 
 
 def _limit_of_stick(
-    osc, clock: StepClock, window, lanes, new: _TimedAttempt, room, reach, lands: bool
+    osc, clock: StepClock, lanes, new: _TimedAttempt, room, reach, lands: bool
 ) -> _GuardMeeting:
     """How a step meets the nearer limit of stuck belts, capacity - needed or capacity + needed.
 
@@ -462,14 +462,13 @@ def take_timed_step(
         theta, cuts = jnp.where(sooner, there, theta), cuts | blocks
         # A lane that stands on the guard at the start of the step lands on it.
         number = jnp.where(sooner & (there * h < NO_STEP), one.number, number)
-    blocked = cuts
 
     last = h >= remaining
     accepted = going & (new.error <= 1)
-    lands = accepted & ~blocked & reached & ~(last & (delta > 0))
+    lands = accepted & ~cuts & reached & ~(last & (delta > 0))
     delta, ends_hold = jnp.where(lands, delta, 0.0), ends_hold & accepted
     lands, number = lands | ends_hold, jnp.where(ends_hold, lanes.hit, number)
-    outcome = jnp.where(accepted, jnp.where(blocked, -1.0, 1.0), 0.0)
+    outcome = jnp.where(accepted, jnp.where(cuts, -1.0, 1.0), 0.0)
     outcome = materialise(jnp.where(lands, 2.0, outcome), ones)
     shortened, kept, lands = outcome < 0, outcome > 0, outcome > 1
     theta = materialise(theta, ones)

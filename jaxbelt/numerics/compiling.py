@@ -216,7 +216,7 @@ class _Kept:
 
     def _found(self, leaves, structure, asked, arrays) -> "programs.KeptProgram | None":
         """The program, loaded or compiled; None where it cannot be kept."""
-        if programs.folder() is None or not programs.can_be_kept(arrays):
+        if programs.folder() is None or not programs.can_be_kept():
             return None
         holes = [programs.HOLE if self.is_array(leaf) else leaf for leaf in leaves]
         template = jax.tree.unflatten(structure, holes)

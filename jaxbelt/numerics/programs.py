@@ -306,7 +306,7 @@ def jax_settings() -> tuple[Any, ...]:
     return _config().trace_context(), _config().debug_nans.value, _config().debug_infs.value
 
 
-def can_be_kept(arrays: list[Any]) -> bool:
+def can_be_kept() -> bool:
     """Whether programs can be kept with the present settings: those for the CPU as the only device,
     without checks of values underway."""
     watched = (
