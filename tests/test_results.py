@@ -297,7 +297,7 @@ def test_a_kind_has_one_colour_in_every_picture(dataset):
     turned = dataset.assign(sticks=dataset.sticks & (dataset.belt == 0)).transpose()
     assert key_of(jb.plot_sweep(turned, "kind"))["equilibrium"] == whole["equilibrium"]
     colours = [_colour_of_kind(f"cycle, sticks to belt {belts}") for belts in ("0", "1", "0 and 1")]
-    assert len({*colours, *COLOURS.values()} - {"#009E73"}) == 3 + 6
+    assert len({*colours, *COLOURS.values()} - {"#009E73"}) == 3 + 8
 
 
 def test_what_is_not_done_is_left_white(dataset):

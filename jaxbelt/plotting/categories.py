@@ -23,6 +23,9 @@ COLOURS = {
     "stuck": "#999999",
     "cycle": "#009E73",
     "cycle without sticking": "#F0E442",
+    "periodic": "#009E73",
+    "quasiperiodic": "#0072B2",
+    "chaotic": "#D55E00",
 }
 #: Colours of all other categories, in order, and of cycles by the belts that they stick to, as
 #: binary digits: belt 0, belt 1, both, belt 2, ... (Okabe and Ito, and a violet).
