@@ -46,7 +46,7 @@ def plot_diagram(
     Stable branches are black, unstable ones grey; unstable cycles are dashed. Dotted lines are the
     special points; in the plane of the paper's Fig. 6 the names of the regions between them stand
     at the upper edge. In "x2" a double arrow joins the velocities of two belts that one cycle
-    sticks to. Between rows the lines are interpolated, from special point to special point.
+    sticks to. Lines are interpolated between rows, separately between special points.
 
     Args:
         diagram: From `bifurcation_diagram`.
@@ -61,7 +61,7 @@ def plot_diagram(
         expected = f"one of {', '.join(QUANTITIES)}, or a function of a cycle"
         came = repr(quantity) + did_you_mean(quantity, QUANTITIES)
         require(quantity in list(QUANTITIES), "quantity", expected, came)
-    # Functionals with a name are defined for equilibria, too.
+    # The quantities of these names are defined for equilibria, too, the functionals are not.
     named = ((amplitude, "amplitude"), (period, "period"))
     quantity = next((name for one, name in named if quantity is one), quantity)
     curves = [_curves_of(branch, quantity) for branch in diagram.branches]
@@ -94,7 +94,7 @@ def _default_quantity(diagram: BifurcationDiagram) -> str:
 
 
 def _curves_of(branch: Branch, quantity: Quantity) -> list[np.ndarray]:
-    """Curves to draw for a branch, [rows] each, NaN where it has no such quantity."""
+    """Curves [rows] to draw for a branch; NaN in rows where the quantity is not defined."""
     if not isinstance(quantity, str):
         return [branch.evaluated(quantity)]
     if quantity == "x1":
@@ -106,7 +106,7 @@ def _curves_of(branch: Branch, quantity: Quantity) -> list[np.ndarray]:
 
 
 def _name_of(functional: Any) -> str:
-    """Name of a functional in words, with the arguments that are fixed."""
+    """Name of a functional in words, with the arguments that a `functools.partial` fixes."""
     if isinstance(functional, functools.partial):
         given = [*map(repr, functional.args), *(f"{k} {v}" for k, v in functional.keywords.items())]
         return f"{_name_of(functional.func)} ({', '.join(given)})"
@@ -115,7 +115,7 @@ def _name_of(functional: Any) -> str:
 
 
 def _stretches_of(flags: np.ndarray) -> list[slice]:
-    """Rows between changes of a flag; each stretch includes the first row of the next one."""
+    """Slices of consecutive rows with equal flags."""
     ends = [0, *(np.flatnonzero(flags[1:] != flags[:-1]) + 1), len(flags)]
     return [slice(a, b) for a, b in pairwise(ends)]
 
@@ -127,18 +127,18 @@ BETWEEN_ROWS = 8
 def _between_rows(
     values: np.ndarray, curve: np.ndarray, special: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The values of the parameter and a curve through them, with points between the rows.
+    """Values of the parameter and of a curve at the rows, with interpolated points between them.
 
     Each piece between special values and turning points is interpolated separately. Akima's cubics,
-    which do not swing where a curve bends suddenly, interpolate its distance from the chord, over
-    an angle in which a branch that ends like a square root is smooth.
+    which do not swing where a curve bends suddenly, interpolate the distance of the piece from its
+    chord, over an angle in which a branch that ends like a square root is smooth.
     """
     way = np.sign(np.diff(values))
     passed = np.searchsorted(np.sort(special), values)
     is_special = np.isin(values, special)
     breaks = (passed[1:] != passed[:-1]) & ~is_special[:-1] & ~is_special[1:]
     turns = np.append(False, way[1:] != way[:-1])
-    # A piece begins behind a special value, or at one, or where the branch turns.
+    # A piece begins at the first row behind a special value, at a row on one, or at a turn.
     behind, at = np.flatnonzero(breaks) + 1, np.flatnonzero(turns | is_special[:-1])
     begins = sorted({0, *behind.tolist(), *at.tolist()})
     pieces = []
@@ -202,8 +202,8 @@ def _join_stick_phases(ax: Axes, diagram: BifurcationDiagram) -> None:
                     ax.annotate("", (at, high), (at, low), arrowprops=style, zorder=2)
 
 
-#: Height of the names of points above the axes, in points; where names are moved aside they are
-#: higher by the fraction STEEPNESS of that move.
+#: Height of the names of special points above the axes, in typographic points; where names are
+#: moved aside, all names are raised by STEEPNESS times the largest move.
 NAMES_ABOVE, STEEPNESS = 9.0, 0.5
 
 
@@ -264,13 +264,13 @@ def _name_regions(ax: Axes, diagram: BifurcationDiagram) -> None:
 def plot_curves(curves: Sequence[BifurcationCurve], ax: Axes | None = None) -> Axes:
     """Draws curves of bifurcation points in the plane of their parameters.
 
-    Special points are dots, open ones where they are not points of double sliding. Each kind has
-    its own style; where a fold turns into a grazing point the style changes. Returns the axes.
+    Special points are dots, filled for double sliding, else open. Each kind of bifurcation has its
+    own line style, which changes where a fold turns into a grazing point. Returns the axes.
     """
     ax = new_axes() if ax is None else ax
     for curve in curves:
         path = curve.path
-        # Rows and special points in order; a special point has the kind of the row before it.
+        # `path` holds rows and special points; a special point gets the kind of the row before it.
         kinds: Any = _kinds_along(curve, path)
         for rows in _stretches_of(kinds):
             rows = slice(rows.start, min(rows.stop + 1, len(path)))
