@@ -16,7 +16,7 @@ from jaxbelt.bifurcations.faces import Faces
 from jaxbelt.bifurcations.labels import Label
 from jaxbelt.bifurcations.pieces import Branch
 from jaxbelt.bifurcations.regions import RegionMap
-from jaxbelt.plotting.diagrams import _between_rows
+from jaxbelt.plotting.diagrams import _between_rows, _up_to_neighbours
 
 
 @pytest.fixture(scope="module")
@@ -487,3 +487,13 @@ def test_a_forced_oscillator_that_is_impossible_at_the_begin_is_named():
     for start in (None, (0.0, 0.0)):
         with pytest.raises(ValueError, match="lower of belt 0 must be < upper"):
             jb.bifurcation_diagram(between, span=(0.0, 3.0), start=start)
+
+
+@pytest.mark.parametrize(("special", "place"), [([1.25], 1.25), ([], 1.5)])
+def test_stretches_of_one_stability_meet_where_it_changes(special, place):
+    """Branches of forced motions have no row at the point between them."""
+    values, curve = np.array([0.0, 1.0, 2.0, 3.0]), np.array([1.0, 3.0, 5.0, 7.0])
+    for rows, expected in ((slice(0, 2), [0.0, 1.0, place]), (slice(2, 4), [place, 2.0, 3.0])):
+        x, y = _up_to_neighbours(values, curve, rows, np.array(special))
+        np.testing.assert_array_equal(x, expected)
+        np.testing.assert_allclose(y, 1 + 2 * x, rtol=1e-15)

@@ -69,7 +69,8 @@ def plot_diagram(
     special = np.array([float(point.value) for point in diagram.points])
     for branch, drawn in zip(diagram.branches, curves, strict=True):
         for rows in _stretches_of(branch.stable + 2 * branch.neutral):
-            lines = [_between_rows(branch.values[rows], curve[rows], special) for curve in drawn]
+            ends = [_up_to_neighbours(branch.values, curve, rows, special) for curve in drawn]
+            lines = [_between_rows(*one, special) for one in ends]
             _draw_rows(ax, branch, rows, lines)
     first, last = diagram.regions[0][0], diagram.regions[-1][1]
     ax.set_xlim(first, last)
@@ -118,6 +119,25 @@ def _stretches_of(flags: np.ndarray) -> list[slice]:
     """Slices of consecutive rows with equal flags."""
     ends = [0, *(np.flatnonzero(flags[1:] != flags[:-1]) + 1), len(flags)]
     return [slice(a, b) for a, b in pairwise(ends)]
+
+
+def _up_to_neighbours(
+    values: np.ndarray, curve: np.ndarray, rows: slice, special: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Values and curve at the rows of a stretch, and where it meets the stretches beside it: at the
+    special value between their rows, else in the middle."""
+    x, y = values[rows], curve[rows]
+    for i, at in ((rows.start, 0), (rows.stop, len(x))):
+        if not 0 < i < len(values):
+            continue
+        low, high = sorted(values[i - 1 : i + 1])
+        between = special[(special > low) & (special < high)]
+        value = between[0] if between.size else 0.5 * (low + high)
+        share = (value - values[i - 1]) / (values[i] - values[i - 1]) if high > low else 0.5
+        x = np.insert(x, at if at == 0 else len(x), value)
+        height = curve[i - 1] + share * (curve[i] - curve[i - 1])
+        y = np.insert(y, at if at == 0 else len(y), height)
+    return x, y
 
 
 #: Points drawn between two rows of a curve.
