@@ -507,8 +507,9 @@ def _fill_in(
 ) -> None:
     """Writes results of the runs `which` into the columns `found`, of `size` runs each."""
     for name, values in results.items():
-        missing = np.full((size, *values.shape[1:]), np.nan)
-        found.setdefault(name, missing)[which] = values
+        if name not in found:
+            found[name] = np.full((size, *values.shape[1:]), np.nan)
+        found[name][which] = values
 
 
 def _have_come_to_rest(found: dict[str, np.ndarray]) -> np.ndarray:
