@@ -38,7 +38,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     bifurcations/   cells faces bounds regions legs branches pieces diagrams switch_folds
     inverse/        selection record search windows fit margins design
     si              results in SI units
-    plotting/       style phase histories forced points diagrams regions categories sweeps orbits
+    plotting/       style histories phase forced points diagrams regions categories sweeps orbits
     plotting/       inverse model draw si explorer
     paper           the paper's table and figures
     api             the public names
@@ -75,9 +75,9 @@ def __getattr__(name: str) -> Any:
 
         with Activity("matplotlib") as activity:
             activity.say("imported")
-            from .plotting import explorer, model, phase, si, sweeps
+            from .plotting import explorer, histories, model, phase, si, sweeps
 
-        modules = explorer, model, phase, si, sweeps
+        modules = explorer, histories, model, phase, si, sweeps
         globals()[name] = value = next(getattr(m, name) for m in modules if hasattr(m, name))
         return value
     if name == "__all__" or name in api.__all__:

@@ -71,8 +71,9 @@ from .sweeps.sweep import Explanation, explain, sweep
 
 if TYPE_CHECKING:
     from .plotting.explorer import explore
+    from .plotting.histories import plot_time_history
     from .plotting.model import plot_friction_law
-    from .plotting.phase import plot_phase_portrait, plot_time_history, plot_vector_field
+    from .plotting.phase import plot_phase_portrait, plot_vector_field
     from .plotting.si import plot_in_si
     from .plotting.sweeps import plot_basins, plot_sweep
 

@@ -242,30 +242,28 @@ def steady_cycle(trajectory: Trajectory) -> SimulatedCycle | None:
 
     The state at slip onset is known in full, so the motion repeats once it comes back.
     """
-    onsets = _onsets(trajectory)
-    if onsets.size < 2:
-        return None
-    times, states = trajectory.events.t, trajectory.events.y
-    last = onsets[-1]
-    same = [i for i in onsets[:-1] if np.allclose(states[i], states[last], atol=1e-6)]
-    if not same:
+    times, states = np.asarray(trajectory.events.t), np.asarray(trajectory.events.y)
+    onsets = np.flatnonzero(trajectory.events.kind == EventKind.SLIP)
+    same = _onsets_at(states[onsets[-1]], trajectory) if onsets.size else onsets
+    if same.size < 2:
         return None
     ts, ys = np.append(trajectory.ts, times), np.vstack([trajectory.ys, states])
-    inside = (ts >= times[same[-1]]) & (ts <= times[last])
+    inside = (ts >= times[same[-2]]) & (ts <= times[same[-1]])
     return SimulatedCycle(ys[inside][np.argsort(ts[inside], kind="stable")])
 
 
-def _onsets(trajectory: Trajectory) -> np.ndarray:
-    return np.flatnonzero(trajectory.events.kind == EventKind.SLIP)
+def _onsets_at(state: np.ndarray, trajectory: Trajectory) -> np.ndarray:
+    """Numbers of the events that are slip onsets at this state."""
+    there = np.all(np.isclose(trajectory.events.y, state, atol=1e-6), axis=1)
+    return np.flatnonzero(there & (np.asarray(trajectory.events.kind) == EventKind.SLIP))
 
 
 def _transient(trajectory: Trajectory, cycle: SimulatedCycle | None) -> Trajectory:
     """The trajectory until it joins the cycle, or until TRANSIENT if that is earlier."""
     end = TRANSIENT
     if cycle is not None:
-        for i in _onsets(trajectory):
-            if np.allclose(trajectory.events.y[i], cycle.states[0], atol=1e-6):
-                end = min(end, trajectory.events.t[i])
+        joined = np.asarray(trajectory.events.t)[_onsets_at(cycle.states[0], trajectory)]
+        end = np.min(joined, initial=end)
     times = trajectory.ts, trajectory.events.t
     shown = tuple(np.where(t <= end, t, np.nan) for t in times)
     return eqx.tree_at(lambda run: (run.ts, run.events.t), trajectory, shown)

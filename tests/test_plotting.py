@@ -15,7 +15,8 @@ from jaxbelt import paper as reproduce
 from jaxbelt.bifurcations.pieces import Branch
 from jaxbelt.cycles.chains import Chain
 from jaxbelt.motion.arcs import Ends
-from jaxbelt.plotting.phase import _vector_field, draw_overview, stick_phases
+from jaxbelt.plotting.histories import stick_phases
+from jaxbelt.plotting.phase import _vector_field, draw_overview
 from jaxbelt.plotting.style import BELT_COLOURS, journal_style, key_entries, save
 
 
@@ -33,7 +34,7 @@ def two_sided():
 
 def spans(ax):
     """(begin, end) of the shaded spans of some axes, in order."""
-    boxes = [patch.get_path().get_extents(patch.get_patch_transform()) for patch in ax.patches]
+    boxes = [path.get_extents() for shades in ax.collections for path in shades.get_paths()]
     return sorted((box.x0, box.x1) for box in boxes)
 
 
@@ -69,10 +70,27 @@ def test_time_history_shades_every_stick_phase_in_the_colour_of_its_belt(two_sid
         np.testing.assert_allclose(spans(ax), [phase[1:] for phase in phases])
     labels = set(axes[0].get_legend_handles_labels()[1])
     assert labels == {"sticks to belt 0", "sticks to belt 1"}
-    assert len({to_hex(patch.get_facecolor()) for patch in axes[0].patches}) == 2
+    assert len({tuple(*shades.get_facecolor()) for shades in axes[0].collections}) == 2
     (x1,) = axes[0].get_lines()
     np.testing.assert_array_equal(np.interp(trajectory.ts, *states(x1).T), trajectory.ys[:, 0])
     assert [ax.get_ylabel() for ax in axes] == ["displacement $x_1$", "velocity $x_2$"]
+
+
+@pytest.mark.filterwarnings("error")
+def test_many_stick_phases_are_one_artist_of_their_belt(two_sided):
+    """With one for each, a picture of 100,000 phases took minutes."""
+    osc, trajectory = two_sided
+    number = 20_000
+    t = jnp.linspace(0.0, 50.0, number, endpoint=False)
+    codes = jnp.array([[0, 1], [1, 1], [-1, 0], [-1, -1]], dtype=jnp.int8)
+    modes = jnp.tile(codes, (number // 4, 1))
+    arcs = jb.Arcs(t, jnp.zeros((number, 2)), modes, jnp.full(number, 50.0 / number))
+    many = eqx.tree_at(lambda run: run.arcs, trajectory, arcs)
+    phases = stick_phases(many)
+    assert len(phases) == number / 2
+    for ax in (*draw_overview(osc, many).axes[:2], many.plot()):
+        assert len(ax.collections) == 2 and not ax.patches
+        np.testing.assert_allclose(spans(ax), [phase[1:] for phase in phases])
 
 
 def test_the_key_of_a_trajectory_has_the_belts_in_order(two_sided):
@@ -299,6 +317,21 @@ def test_steady_cycle_is_closed_and_sticks(two_sided):
     # It reaches both belts and stays between them.
     assert cycle.states[:, 1].min() == pytest.approx(-0.2, abs=1e-12)
     assert cycle.states[:, 1].max() == pytest.approx(0.35, abs=1e-12)
+
+
+def test_the_steady_cycle_lasts_from_the_last_onset_but_one_to_the_last(two_sided):
+    _, trajectory = two_sided
+    events = trajectory.events
+    t, y = np.asarray(events.t), np.asarray(events.y)
+    slips = np.flatnonzero(events.kind == jb.EventKind.SLIP)
+    last = slips[-1]
+    before = next(i for i in slips[-2::-1] if np.allclose(y[i], y[last], atol=1e-6))
+    inside = (trajectory.ts >= t[before]) & (trajectory.ts <= t[last])
+    cycle = reproduce.steady_cycle(trajectory)
+    assert cycle is not None
+    states = cycle.states
+    assert len(states) == np.sum(inside) + last - before + 1
+    np.testing.assert_array_equal(states[[0, -1]], y[[before, last]])
 
 
 def test_no_steady_cycle_where_the_mass_comes_to_rest():

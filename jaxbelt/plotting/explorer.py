@@ -19,8 +19,9 @@ from ..model.oscillator import Oscillator, check_oscillator, refuse_clock
 from ..model.parameters import names_of
 from ..motion.simulate import simulate
 from ..results import Status, describe
+from .histories import plot_time_history
 from .model import plot_friction_law
-from .phase import plot_phase_portrait, plot_time_history
+from .phase import plot_phase_portrait
 from .si import plot_in_si
 from .style import belt_colour
 

@@ -1,4 +1,4 @@
-"""One oscillator and its motion: time histories, phase portraits, vector fields.
+"""One oscillator in its phase plane: portraits, vector fields, and a page with the histories.
 
 Every function draws into the matplotlib axes `ax` (None makes new ones) and returns the axes. The
 conventions are the paper's:
@@ -17,14 +17,13 @@ from typing import Any, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 import matplotlib
-import matplotlib.colors
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
 from ..activity import announced
-from ..checks import as_interval, require, require_one_of, require_value
+from ..checks import as_interval, require_one_of, require_value
 from ..cycles.cycle import Cycle
 from ..cycles.portrait import Portrait
 from ..cycles.separatrices import Separatrix
@@ -41,24 +40,18 @@ from ..model.oscillator import (
 from ..model.transitions import mode_of_state
 from ..motion.simulate import Trajectory
 from ..numerics.compiling import jit
+from .histories import check_trajectory, path_of, plot_time_history
 from .style import (
-    COORDINATES,
-    TIME,
     add_key,
     belt_colour,
     figure_of,
     journal_figure,
-    key_columns,
-    key_entries,
     label_plane,
     new_axes,
-    new_figure,
     require_axes,
     spread,
 )
 
-#: Hatches that identify the belts in print without colour.
-BELT_HATCHES = ("", "////", "....", "xxxx", "\\\\\\\\")
 ORBIT_COLOUR = "0.55"
 #: Style of the pieces of a boundary where the mass sticks, in the colour of the belt.
 SLIDING_SET: dict[str, Any] = {"linewidth": 4.5, "alpha": 0.25, "solid_capstyle": "butt"}
@@ -86,106 +79,7 @@ class ClosedOrbit(Protocol):
         ...
 
 
-# --- time histories -----------------------------------------------------------------------------
-
-
-def plot_time_history(trajectory: Trajectory, ax: Sequence[Axes] | None = None) -> Sequence[Axes]:
-    """Draws displacement x1 and velocity x2 over time, stick phases shaded in the colour of their
-    belt.
-
-    Args:
-        trajectory: From `simulate`.
-        ax: Two axes, for x1 and for x2; None makes new ones.
-
-    Returns:
-        The two axes.
-
-    Raises:
-        ValueError: If an argument is impossible; the message names it.
-    """
-    _check_trajectory(trajectory, "trajectory")
-    is_pair = isinstance(ax, Sequence | np.ndarray) and len(ax) == 2
-    pair = ax is None or (is_pair and all(isinstance(one, Axes) for one in ax))
-    require_value(pair, "ax", "two axes of matplotlib, such as plt.subplots(2)[1], or None", ax)
-    t, ys = path_of(trajectory)
-    if ax is None:
-        ax = tuple(new_figure().subplots(2, sharex=True))
-    upper, lower = ax
-    for axes, values, name in zip(ax, ys.T, COORDINATES.values(), strict=True):
-        axes.plot(t, values, color="black", linewidth=0.9)
-        axes.set_ylabel(name)
-        axes.margins(x=0)
-    for belt, begin, end in stick_phases(trajectory):
-        for axes in ax:
-            axes.axvspan(begin, end, label=f"sticks to belt {belt}", zorder=0, **belt_shading(belt))
-    upper.tick_params(labelbottom=False)
-    lower.set_xlabel(TIME)
-    figure_of(lower).align_ylabels(ax)
-    entries = key_entries([upper])
-    if entries:
-        labels = sorted(entries)
-        width = upper.get_window_extent().width * 72 / figure_of(upper).dpi
-        upper.legend(
-            [entries[label] for label in labels],
-            labels,
-            loc="lower right",
-            bbox_to_anchor=(1.0, 1.0),
-            ncols=key_columns(width, labels),
-            frameon=False,
-            borderaxespad=0.2,
-        )
-    return ax
-
-
-def _check_trajectory(trajectory: Any, field: str) -> None:
-    expected = "a Trajectory, such as jb.simulate(...)"
-    require_value(isinstance(trajectory, Trajectory), field, expected, trajectory)
-
-
-def _check_window(xlim: Any, ylim: Any) -> None:
-    for name, limits in (("xlim", xlim), ("ylim", ylim)):
-        if limits is not None:
-            as_interval(limits, name)
-
-
-def stick_phases(trajectory: Trajectory) -> list[tuple[int, float, float]]:
-    """Stick phases of a trajectory as (belt, begin, end), in order of their beginnings."""
-    # Approximate formulations have no arcs; their samples are used.
-    if trajectory.arcs.t.size:
-        begins = np.asarray(trajectory.arcs.t)
-        ends = begins + np.asarray(trajectory.arcs.duration)
-        modes = np.asarray(trajectory.arcs.mode)
-    else:
-        begins, ends = np.asarray(trajectory.ts)[:-1], np.asarray(trajectory.ts)[1:]
-        modes = np.asarray(trajectory.modes)[:-1]
-    stuck = (modes == 0) & np.isfinite(begins)[:, None]
-    phases: list[tuple[int, float, float]] = []
-    for belt in range(stuck.shape[1]):
-        # A phase consists of several arcs if another belt begins or ends contact meanwhile.
-        switches = np.flatnonzero(np.diff(stuck[:, belt], prepend=False, append=False))
-        for first, after in switches.reshape(-1, 2):
-            phases.append((belt, float(begins[first]), float(ends[after - 1])))
-    return sorted(phases, key=lambda phase: phase[1])
-
-
-def belt_shading(belt: int) -> dict[str, Any]:
-    """Style of the stick phases of a belt: pale, with hatches for print without colour."""
-    colour = matplotlib.colors.to_rgba(belt_colour(belt))
-    pale = tuple(1 - 0.28 * (1 - channel) for channel in colour[:3])
-    hatch = BELT_HATCHES[belt % len(BELT_HATCHES)]
-    return {"facecolor": pale, "edgecolor": (*colour[:3], 0.45), "linewidth": 0.0, "hatch": hatch}
-
-
-def path_of(trajectory: Trajectory, field: str = "trajectory") -> tuple[np.ndarray, np.ndarray]:
-    """Times and states of a trajectory, its events among the samples so that corners are sharp;
-    a `ValueError` that names the field where there is none."""
-    t = np.concatenate([trajectory.ts, trajectory.events.t])
-    ys = np.concatenate([trajectory.ys, trajectory.events.y])
-    known = np.isfinite(t) & np.all(np.isfinite(ys), axis=1)
-    if not np.any(known):
-        require(False, field, "a run with finite samples", repr(trajectory))
-    order = np.argsort(t[known], kind="stable")
-    return t[known][order], ys[known][order]
+# --- phase portraits ----------------------------------------------------------------------------
 
 
 def path_around(cycle: ClosedOrbit) -> np.ndarray:
@@ -196,9 +90,6 @@ def path_around(cycle: ClosedOrbit) -> np.ndarray:
         return ys
     t = np.concatenate([np.linspace(0.0, float(cycle.period), len(ys)), cycle.arcs.t])
     return np.concatenate([ys, cycle.arcs.y])[np.argsort(t, kind="stable")]
-
-
-# --- phase portraits ----------------------------------------------------------------------------
 
 
 @announced("plot_phase_portrait")
@@ -236,7 +127,7 @@ def plot_phase_portrait(
     many = isinstance(trajectories, Sequence)
     require_value(many, "trajectories", "one or several of simulate", trajectories)
     for trajectory in trajectories:
-        _check_trajectory(trajectory, "trajectories")
+        check_trajectory(trajectory, "trajectories")
     fits = isinstance(cycles, Sequence) and all(hasattr(cycle, "sample") for cycle in cycles)
     require_value(fits, "cycles", "a list of cycles, such as [jb.find_cycle(...)]", cycles)
     known = equilibria is None or isinstance(equilibria, Equilibria)
@@ -512,6 +403,12 @@ def _draw_arrowheads(ax: Axes, path: np.ndarray, colour: str, indices: Sequence[
             },
             zorder=4,
         )
+
+
+def _check_window(xlim: Any, ylim: Any) -> None:
+    for name, limits in (("xlim", xlim), ("ylim", ylim)):
+        if limits is not None:
+            as_interval(limits, name)
 
 
 # --- vector field -------------------------------------------------------------------------------
