@@ -30,7 +30,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     cycles/         unstable outlines nearest sides shocks
     sweeps/         observers moments along reducers attractor growth winding strobes queue
     sweeps/         threads runs_in_memory audit grid datasets question locks store progress work
-    sweeps/         clusters sweep shares
+    sweeps/         clusters sweep verification shares
     sweeps/         naming forced_basins basins fractions orbit_diagram circle_map
     bifurcations/   special labels beside systems timed_systems guesses base conditions arc_rows
     bifurcations/   forced symmetry forced_edges tangencies crossings rests edge_rests edges folds

@@ -66,8 +66,8 @@ from .sweeps.fractions import BasinFractions, basin_fractions
 from .sweeps.moments import AtEvents, AtExtrema, AtPhase, AtSection, AtTimes
 from .sweeps.orbit_diagram import OrbitDiagram, orbit_diagram
 from .sweeps.shares import attractors
-from .sweeps.store import Verified, verify
 from .sweeps.sweep import Explanation, explain, sweep
+from .sweeps.verification import Verified, verify
 
 if TYPE_CHECKING:
     from .plotting.explorer import explore

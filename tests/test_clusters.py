@@ -60,7 +60,7 @@ def test_workers_do_what_the_sweep_does(client, tmp_path, whole, capsys):
     path = tmp_path / "a.zarr"
     found = again(path, executor=client, progress=True)
     assert kills.Kept(path).identical_values(whole) and found.equals(whole)
-    assert jb.verify(path) == stores.Verified((0, 1, 2, 3, 4), (), (), True)
+    assert jb.verify(path) == jb.Verified((0, 1, 2, 3, 4), (), (), True)
     assert "15 of 15 runs" in " ".join(capsys.readouterr().err.split())
     assert kills.times_done(path).tolist() == [1] * 5
     assert not [left for left in (tmp_path / ".a.zarr.locks").iterdir() if left.name != "door"]

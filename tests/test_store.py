@@ -127,7 +127,7 @@ def test_a_store_is_what_the_sweep_gives(path, whole):
         and "jaxbelt.sweep(jaxbelt.presets.class_b" in told["call"]
     )
     assert " at 0x" not in json.dumps({k: str(v) for k, v in told.items()})
-    assert jb.verify(path) == stores.Verified((0, 1, 2, 3, 4), (), (), True)
+    assert jb.verify(path) == jb.Verified((0, 1, 2, 3, 4), (), (), True)
 
 
 @pytest.mark.parametrize(

@@ -18,10 +18,10 @@ def verify(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Compute the checksums of a store again and show which of its blocks are right.
+    """Compute the checksums of a store again and show which of its blocks and axes are right.
 
-    Exit code 1 if there are bad blocks and they are not repaired. After a repair the command or the
-    call that made the store does the marked blocks again.
+    Exit code 1 if there are bad blocks or axes and they are not repaired. After a repair the
+    command or the call that made the store does the marked blocks again, and writes bad axes again.
 
     Example: **jaxbelt verify plane.zarr --repair**
     """
@@ -31,5 +31,5 @@ def verify(
         turn_on_float64()
         found = jb.verify(store, repair)
     say([repr(found)], as_json=as_json, data=asdict(found))
-    if found.bad and not repair:
+    if (found.bad or found.axes) and not repair:
         raise typer.Exit(1)

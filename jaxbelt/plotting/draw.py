@@ -24,8 +24,8 @@ from ..sweeps.basins import Basins, BasinStability
 from ..sweeps.circle_map import CircleMap
 from ..sweeps.fractions import BasinFractions
 from ..sweeps.orbit_diagram import OrbitDiagram
-from ..sweeps.store import Verified
 from ..sweeps.sweep import Explanation
+from ..sweeps.verification import Verified
 from .diagrams import plot_curves, plot_diagram, plot_special_point
 from .forced import plot_circle_map, plot_exponents, plot_motion
 from .histories import plot_arcs, plot_events, plot_trajectory

@@ -18,8 +18,8 @@ from ..sweeps.basins import Basins, BasinStability, standard_error
 from ..sweeps.datasets import decoded
 from ..sweeps.fractions import BasinFractions
 from ..sweeps.naming import is_cycle
-from ..sweeps.store import Verified
 from ..sweeps.sweep import Explanation
+from ..sweeps.verification import Verified
 from .categories import LINE, draw_categories, words_of_runs
 from .phase import plot_phase_portrait
 from .style import (

@@ -5,6 +5,7 @@
 - `queue`: the compiled loop that fills lanes from a queue of runs; `threads`: a loop on each core;
 - `grid`, `question`: the points of a sweep; its checked arguments and its identity;
 - `datasets`, `store`: the results, in memory and in a Zarr group; `locks`: who may write it;
+  `verification`: whether it is what was written;
 - `work`: does the blocks in this process; `clusters`: does them as tasks of a Dask cluster;
   `progress`: a bar;
 - `sweep`: named axes in, a labelled dataset out; `audit`: repeats runs without shortcuts;

@@ -169,7 +169,7 @@ class Question:
         grid = self.grid
         leaves, _ = jax.tree_util.tree_flatten_with_path(grid.example)
         parameters = [f"{jax.tree_util.keystr(path)}={float(leaf)!r}" for path, leaf in leaves]
-        identity = {f"axis {name}": _hash(axis.tobytes()) for name, axis in grid.axes.items()}
+        identity = {f"axis {name}": digest(axis.tobytes()) for name, axis in grid.axes.items()}
         identity["axes"] = ", ".join(f"{name} ({axis.size})" for name, axis in grid.axes.items())
         identity["y0"] = repr(tuple(grid.y0.values()))
         identity["oscillator"] = ", ".join(parameters)
@@ -307,7 +307,7 @@ def _kinds_of(module: eqx.Module, name: str) -> str:
         for argument in inspect.signature(type(part)).parameters
         if isinstance(getattr(part, argument, None), tuple)
     ]
-    return f"{names}, {_hash(repr(static).encode())}" if static else names
+    return f"{names}, {digest(repr(static).encode())}" if static else names
 
 
 def _modules_in(module: eqx.Module) -> Iterator[eqx.Module]:
@@ -326,5 +326,6 @@ def _plain(text: str) -> str:
     return re.sub(r" at 0x[0-9a-fA-F]+", "", text)
 
 
-def _hash(data: bytes) -> str:
+def digest(data: bytes) -> str:
+    """Short digest of bytes, in the identity of a sweep."""
     return hashlib.sha256(data).hexdigest()[:16]

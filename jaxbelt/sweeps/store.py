@@ -11,7 +11,8 @@ content of a block does not depend on when or where it was computed. Beside the 
 - the codes of categories that are numbered when all runs are done, see `lanes.Variable.name_of`.
 
 The attributes of the group contain the question of the sweep; a sweep with another question is
-refused.
+refused. The question has digests of the axes: coordinates that do not agree with them are written
+again by the sweep, which is given the axes.
 """
 
 import hashlib
@@ -31,16 +32,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..checks import as_path, require, require_value
-from ..results import draw
-from ..tables import table_of
+from ..checks import require
 from .datasets import NUMBERED, renumber
 from .grid import Blocks, Grid
 from .locks import hidden_beside, locked
-from .question import Question
+from .question import Question, digest
 
 if TYPE_CHECKING:
-    import pandas
     import xarray
 
 #: Version of the layout described above.
@@ -84,21 +82,24 @@ class Store:
 
         part: the first block to do, and the one behind the last; None: all blocks.
         """
-        if _is_finished(path):
+        if _is_complete(path):
             yield cls(path, question, part)
             return
         _check_folder(path)
+        opened: list[Store] = []
 
         def prepare():
             if not (path / "zarr.json").exists():
                 _create(path, question)
             if part is None:
                 _sweep_out(path)
+            opened.append(cls(path, question, part))
+            opened[0].write_axes()
 
         with ExitStack() as stack:
             with _writes(path):
                 stack.enter_context(locked(path, *(part or ()), prepare=prepare))
-            yield cls(path, question, part)
+            yield opened[0]
 
     @classmethod
     def finish_if_done(cls, path: Path, question: Question) -> "Store":
@@ -122,19 +123,17 @@ class Store:
     ):
         """known: hash of the question, if another process has already compared all of it."""
         self.path, self.question, self.table = path, question, question.table
-        self.root = _open(path)
-        self.hash = self.root.attrs["jaxbelt_hash"]
+        self.content = content = Content(path)
+        self.root, self.ledger, self.hash = content.root, content.ledger, content.hash
         if known is None:
-            _check_question(path, self.root, question)
+            _check_question(content, question)
         elif known != self.hash:
             raise ValueError(f"store must be that of this very sweep, got another one in {path}")
-        self.ledger = self.root["ledger"]
-        self.blocks = Blocks(question.grid.shape, self.ledger.attrs["block"])
+        self.blocks, self.finished = content.blocks, content.finished
         self.part = range(len(self.blocks))[slice(*(part or (None,)))]
-        self.rows = _ledger_rows(path, self.ledger)
-        self.finished = bool(self.ledger.attrs["finished"])
+        self.rows = content.all_rows()
         self.to_do = [block for block in self.part if not self.is_done(block)]
-        self.arrays = {name: _array(self.root, name) for name in self.ledger.attrs["variables"]}
+        self.arrays = content.arrays
         self.waiting: dict[int, _Waiting] = {}
         self.lock = threading.Lock()
         self.began = time.monotonic()
@@ -146,7 +145,7 @@ class Store:
     def read_rows(self, *blocks: int) -> None:
         """Reads the rows of blocks that other processes may have written."""
         for block in blocks:
-            self.rows[block] = np.asarray(self.ledger["blocks"][block])
+            self.rows[block] = np.asarray(self.content.rows[block])
 
     def statuses(self, block: int) -> np.ndarray:
         """Statuses of the runs of a block."""
@@ -175,8 +174,8 @@ class Store:
             array[place] = parts[name]
         attempts = self.rows[block, TIMES_DONE] + 1
         seconds, self.began = time.monotonic() - self.began, time.monotonic()
-        row = np.array([DONE, _checksum(parts[name] for name in self.arrays), attempts, seconds])
-        self.ledger["blocks"][block] = row
+        row = np.array([DONE, checksum(parts[name] for name in self.arrays), attempts, seconds])
+        self.content.rows[block] = row
         self.rows[block] = row
 
     @property
@@ -217,7 +216,7 @@ class Store:
             for block in range(len(self.blocks)):
                 codes |= set(np.unique(self.arrays[name][self.blocks.slices(block)]).tolist())
             numbers, named = self.table.numbering(name, sorted(codes))
-            shown = _array(self.root, name, numbered=True)
+            shown = self.content.shown[name]
             for block in range(len(self.blocks)):
                 place = self.blocks.slices(block)
                 shown[place] = renumber(np.asarray(self.arrays[name][place]), numbers)
@@ -226,6 +225,19 @@ class Store:
         _consolidate(self.path)
         _sweep_out(self.path)
         self.ledger.attrs["finished"] = self.finished = True
+
+    def write_axes(self) -> None:
+        """Writes the coordinates again that are not those of the question."""
+        harmed = self.content.harmed_axes()
+        if not harmed:
+            return
+        known, new = self.table.coordinates(), hidden_beside(self.path, "axes")
+        _write_coordinates(new, {name: known[name] for name in harmed})
+        for name in harmed:
+            shutil.rmtree(self.path / name, ignore_errors=True)
+            os.replace(new / name, self.path / name)
+        shutil.rmtree(new)
+        _consolidate(self.path)
 
     def add_attributes(self, attributes: dict[str, Any]) -> None:
         """Adds attributes to the dataset."""
@@ -242,7 +254,86 @@ class Store:
 # --- opening and creating -------------------------------------------------------------------------
 
 
-def _open(path: Path, mode: Any = "r+") -> Any:
+class Content:
+    """What is in a store, as its metadata say, for sweeps and `verify`.
+
+    Attributes:
+        root: The group.
+        identity: The identity of the question, and hash, that of it.
+        ledger: The group of the ledger, and rows, its array of blocks.
+        blocks: The blocks of the grid.
+        finished: Whether the store is marked as finished.
+        arrays: The arrays of the variables; of those that are numbered, their codes.
+        shown: The arrays of the numbers of these, by name.
+    """
+
+    def __init__(self, path: Path, mode: Any = "r+"):
+        self.path, self.root = path, _open(path, mode)
+        with _reading(path, ""):
+            attributes = self.root.attrs
+            question, self.hash = attributes["jaxbelt_question"], attributes["jaxbelt_hash"]
+            self.identity: dict[str, str] = json.loads(question)
+            if _hash_of(question) != self.hash:
+                raise ValueError("the question and its hash do not agree")
+        with _reading(path, "ledger"):
+            self.ledger = self.root["ledger"]
+            about = self.ledger.attrs
+            shape, names = tuple(about["shape"]), list(about["variables"])
+            self.blocks = Blocks(shape, about["block"])
+            self.finished, numbered = bool(about["finished"]), list(about["numbered"])
+        self.rows = self._array("ledger/blocks", (len(self.blocks), 4))
+        self.shown = {name: self._array(name, shape) for name in numbered}
+        self.arrays = {
+            name: self._array(f"ledger/{name}_codes" if name in numbered else name, shape)
+            for name in names
+        }
+
+    def _array(self, name: str, shape: tuple[int, ...]) -> Any:
+        """An array whose first axes have this shape."""
+        with _reading(self.path, name):
+            array = self.root[name]
+            if array.shape[: len(shape)] != shape:
+                raise ValueError(f"shape {array.shape} does not begin with {shape}")
+            # A chunk of NaN only has to be written, too, to count as done.
+            return array.with_config({"write_empty_chunks": True})
+
+    def all_rows(self) -> np.ndarray:
+        """The ledger's rows of all blocks."""
+        try:
+            return np.array(self.rows[:])
+        except Exception as error:  # whatever a codec raises for bytes that are not its own
+            raise ValueError(
+                f"store must have a ledger that can be read, got a harmed one in {self.path} "
+                f"({error}); `jaxbelt verify {self.path} --repair` finds what is left of it"
+            ) from None
+
+    def axis(self, name: str) -> np.ndarray | None:
+        """Values of a coordinate; None where they cannot be read."""
+        try:
+            return np.asarray(self.root[name][:])
+        except Exception:  # whatever a codec raises for bytes that are not its own
+            return None
+
+    def harmed_axes(self) -> list[str]:
+        """Names of the coordinates whose values are not those of the question."""
+        known = {
+            name.removeprefix("axis "): value
+            for name, value in self.identity.items()
+            if name.startswith("axis ")
+        }
+        for array in self.arrays.values():
+            for name, size in zip(array.metadata.dimension_names or (), array.shape, strict=False):
+                if name == "belt":
+                    known[name] = digest(np.arange(size).tobytes())
+        values = {name: self.axis(name) for name in known}
+        return [
+            name
+            for name, digested in known.items()
+            if (found := values[name]) is None or digest(found.tobytes()) != digested
+        ]
+
+
+def _open(path: Path, mode: Any) -> Any:
     """Opens the group of a store and checks its schema."""
     import zarr
 
@@ -261,6 +352,23 @@ def _open(path: Path, mode: Any = "r+") -> Any:
     return root
 
 
+@contextmanager
+def _reading(path: Path, part: str) -> Iterator[None]:
+    """Makes an error in the metadata of a part of a store name their file and say what to do."""
+    try:
+        yield
+    except Exception as error:  # whatever Zarr raises for metadata that are none
+        raise ValueError(
+            f"store must have metadata that can be read, got harmed ones in "
+            f"{path / part / 'zarr.json'} ({type(error).__name__}: {error}); put this file back "
+            f"from a copy of the store, or do the sweep again in a new one"
+        ) from None
+
+
+def _hash_of(question: str) -> str:
+    return hashlib.sha256(question.encode()).hexdigest()
+
+
 def _consolidate(path: Path) -> None:
     """Copies all metadata to one place, where xarray looks for them first."""
     import zarr
@@ -271,16 +379,12 @@ def _consolidate(path: Path) -> None:
         zarr.consolidate_metadata(path)
 
 
-def _array(root: Any, name: str, numbered: bool = False) -> Any:
-    """Array of a variable; of a numbered category that of its codes or, if `numbered`, numbers."""
-    codes = f"{name}_codes"
-    array = root["ledger"][codes] if codes in root["ledger"] and not numbered else root[name]
-    # A chunk of fill values only, such as NaN, has to be written, too, to count as done.
-    return array.with_config({"write_empty_chunks": True})
-
-
-def _is_finished(path: Path) -> bool:
-    return (path / "zarr.json").exists() and bool(_open(path, "r")["ledger"].attrs["finished"])
+def _is_complete(path: Path) -> bool:
+    """Whether there is a store that is finished and has the axes of its question."""
+    if not (path / "zarr.json").exists():
+        return False
+    content = Content(path, "r")
+    return content.finished and not content.harmed_axes()
 
 
 def _check_folder(path: Path) -> None:
@@ -314,21 +418,18 @@ def _sweep_out(path: Path) -> None:
 
 def _create(path: Path, question: Question) -> None:
     """Creates an empty store, which appears in its place when it is complete."""
-    import xarray
     import zarr
 
     table, grid = question.table, question.grid
     blocks = blocks_of(grid)
-    identity = _identity(question, blocks)
+    identity = json.dumps(_identity(question, blocks))
     attributes = question.attributes() | {
         "jaxbelt_schema": SCHEMA,
-        "jaxbelt_question": json.dumps(identity),
-        "jaxbelt_hash": hashlib.sha256(json.dumps(identity).encode()).hexdigest(),
+        "jaxbelt_question": identity,
+        "jaxbelt_hash": _hash_of(identity),
     }
     new = hidden_beside(path, "new")
-    shutil.rmtree(new, ignore_errors=True)
-    empty = xarray.Dataset(coords=table.coordinates(), attrs=attributes)
-    empty.to_zarr(new, mode="w", zarr_format=3, consolidated=False)
+    _write_coordinates(new, table.coordinates(), attributes)
     root = zarr.open_group(new, mode="r+", use_consolidated=False)
     ledger = root.create_group("ledger")
     numbered = table.numbered()
@@ -371,33 +472,34 @@ def _create(path: Path, question: Question) -> None:
     new.rmdir()
 
 
-def _ledger_rows(path: Path, ledger: Any) -> np.ndarray:
-    """The ledger's rows of all blocks."""
-    try:
-        return np.array(ledger["blocks"][:])
-    except Exception as error:  # codecs raise all kinds of errors for damaged bytes
-        raise ValueError(
-            f"store must have a ledger that can be read, got a harmed one in {path} ({error}); "
-            f"`jaxbelt verify {path} --repair` finds what is left of it"
-        ) from None
+def _write_coordinates(
+    new: Path, coordinates: dict[str, Any], attributes: dict[str, Any] | None = None
+) -> None:
+    """Makes a group of coordinates, with these attributes; one that is there is replaced."""
+    import xarray
+
+    shutil.rmtree(new, ignore_errors=True)
+    empty = xarray.Dataset(coords=coordinates, attrs=attributes)
+    empty.to_zarr(new, mode="w", zarr_format=3, consolidated=False)
 
 
 def _identity(question: Question, blocks: Blocks) -> dict[str, str]:
     return question.identity() | {"the size of a block": repr(blocks.box)}
 
 
-def _check_question(path: Path, root: Any, question: Question) -> None:
+def _check_question(content: Content, question: Question) -> None:
     """Raises unless the store is of this very sweep, and names what differs."""
-    there = json.loads(root.attrs["jaxbelt_question"])
-    # A store keeps the size of blocks that it was made with.
-    here = _identity(question, Blocks(question.grid.shape, root["ledger"].attrs["block"]))
+    path, there = content.path, content.identity
+    # A store keeps the blocks that it was made with.
+    here = _identity(question, content.blocks)
     for name in dict.fromkeys([*there, *here]):
         axis = name.removeprefix("axis ")
         if axis != name and not (name in there and name in here):
             continue  # the difference of their list, "axes", is reported
         if here.get(name) != there.get(name):
-            if axis != name and axis in question.grid.axes and axis in root:
-                pair = root[axis][:].tolist(), question.grid.axes[axis].tolist()
+            known = content.axis(axis) if axis != name else None
+            if known is not None:
+                pair = known.tolist(), question.grid.axes[axis].tolist()
             else:
                 pair = [str(there.get(name))], [str(here.get(name))]
                 # Long texts, such as the leaves of an oscillator, are compared by entries.
@@ -427,117 +529,9 @@ def _as_json(attributes: dict[str, Any]) -> dict[str, Any]:
     return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in attributes.items()}
 
 
-def _checksum(parts: Any) -> float:
+def checksum(parts: Any) -> float:
     """CRC-32 of the bytes of a block's variables, in order."""
     total = 0
     for part in parts:
         total = zlib.crc32(np.asarray(part).tobytes(), total)
     return float(total)
-
-
-# --- verifying ------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Verified:
-    """Blocks of a store by state; what `verify` returns.
-
-    Attributes:
-        done: Numbers of blocks that are done and right.
-        to_do: Numbers of blocks that are not done.
-        bad: Numbers of blocks whose data are not what was written.
-        finished: Whether all blocks are right and the categories numbered.
-    """
-
-    done: tuple[int, ...]
-    to_do: tuple[int, ...]
-    bad: tuple[int, ...]
-    finished: bool
-
-    def table(self) -> "pandas.DataFrame":
-        """Returns a row for each block, in order; columns: block, state ("right", "to do" or
-        "bad")."""
-        named = {"right": self.done, "to do": self.to_do, "bad": self.bad}
-        pairs = sorted((block, state) for state, blocks in named.items() for block in blocks)
-        blocks, states = [block for block, _ in pairs], [state for _, state in pairs]
-        return table_of({"block": np.array(blocks, int), "state": np.array(states, str)})
-
-    def plot(self, ax: Any = None) -> Any:
-        """Draws the blocks in rows, coloured by their states.
-
-        Args:
-            ax: Axes; None makes new ones.
-
-        Returns:
-            The axes.
-        """
-        return draw(self, ax)
-
-    def __repr__(self) -> str:
-        bad = f" ({', '.join(map(str, self.bad[:10]))}{', ...' * (len(self.bad) > 10)})"
-        return (
-            f"Verified({len(self.done)} blocks right, {len(self.to_do)} to do, {len(self.bad)} bad"
-            f"{bad if self.bad else ''}; {'finished' if self.finished else 'not finished'})"
-        )
-
-
-def verify(path: str | Path, repair: bool = False) -> Verified:
-    """Checks whether the data in a store are what was written: all checksums are computed again.
-
-    Args:
-        path: Folder of a store that `sweep` wrote.
-        repair: Whether to mark bad blocks as to do, so that the call that made the store does them
-            again.
-
-    Returns:
-        The blocks by state, `Verified`.
-
-    Raises:
-        ValueError: If there is no store that this version knows.
-        OSError: If a sweep is writing it and `repair` is set.
-    """
-    path = as_path(path, "path")
-    require_value(isinstance(repair, bool), "repair", "True or False", repair)
-    require(path.exists(), "path", "that of a store, a folder", f"{path}, which is not there")
-    root = _open(path, "r")
-    if not repair:
-        return _verified(root)
-    with locked(path):
-        root = _open(path)
-        found = _verified(root)
-        for block in found.bad:
-            root["ledger"]["blocks"][block] = np.zeros(4)
-        if not found.finished:
-            root["ledger"].attrs["finished"] = False
-    return found
-
-
-def _verified(root: Any) -> Verified:
-    ledger = root["ledger"]
-    blocks = Blocks(tuple(ledger.attrs["shape"]), ledger.attrs["block"])
-    arrays = [_array(root, name) for name in ledger.attrs["variables"]]
-    states: dict[str, list[int]] = {"done": [], "to do": [], "bad": []}
-    finished = bool(ledger.attrs["finished"])
-    for block in range(len(blocks)):
-        state = _state(root, ledger, arrays, block, blocks.slices(block), finished)
-        states[state].append(block)
-    done, to_do, bad = map(tuple, states.values())
-    return Verified(done, to_do, bad, finished and len(done) == len(blocks))
-
-
-def _state(root, ledger, arrays, block: int, place: tuple[slice, ...], finished: bool) -> str:
-    """State of a block: done, to do or bad."""
-    try:
-        row = np.asarray(ledger["blocks"][block])
-        if row[STATE] == TO_DO and not finished:
-            return "to do"
-        parts = [np.asarray(array[place]) for array in arrays]
-        right = row[STATE] == DONE and _checksum(parts) == row[CHECKSUM]
-        for name in ledger.attrs["numbered"] if finished else ():
-            numbers = {int(k): v for k, v in ledger.attrs[f"{name}_numbers"].items()}
-            codes = np.asarray(_array(root, name)[place])
-            shown = np.asarray(_array(root, name, numbered=True)[place])
-            right = right and np.array_equal(renumber(codes, numbers), shown)
-        return "done" if right else "bad"
-    except Exception:  # codecs raise all kinds of errors for damaged bytes
-        return "bad"
