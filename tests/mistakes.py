@@ -744,6 +744,7 @@ MISTAKES = [
     ("jaxbelt map --axes nu0 zta", "axes must be one of nu0, .* got zta .did you mean 'zeta'"),
     ("jaxbelt map --cells 1", "cells must be at least 2, got 1"),
     ("jaxbelt basins --points 1", "points must be at least 2, got 1"),
+    ("jaxbelt basins --points 1000000000", "points must be at most .* no memory for more results"),
     ("jaxbelt basins --x1 3 0", r"x1 must be FROM TO with FROM < TO, got 3\.0 0\.0"),
     ("jaxbelt sweep nu0", "an axis must be NAME=FROM:TO:COUNT or NAME=VALUE, got 'nu0'"),
     ("jaxbelt sweep nu0=1 'belts[0].velocity=2'", r"different ones, got belts\[0\].velocity twice"),

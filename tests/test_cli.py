@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 import jaxbelt as jb
 from jaxbelt import paper as reproduce
 from jaxbelt.cli import app
+from jaxbelt.commands import options
 from jaxbelt.commands.belts import parse_belt
 from jaxbelt.commands.description import Description
 from jaxbelt.commands.options import tolerances
@@ -273,6 +274,53 @@ def test_simulate_tells_what_is_wrong_in_one_sentence(tmp_path, arguments, sente
     assert result.stderr == f"Error: {sentence}\n"
     assert result.stdout == ""
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("basins --points 1000000", "points must be at most 6553, got 1000000"),
+        ("basins --starts 1000000000", "starts must be at most 42949672, got 1000000000"),
+        ("basins --starts -1", "starts must be at least 0, got -1"),
+        ("map --cells 1000000000", "cells must be at most 2930, got 1000000000"),
+        ("simulate --samples 1000000000", "samples must be at most 42949672, got 1000000000"),
+        ("diagram --rows 1000000", "rows must be at most 858993, got 1000000"),
+        ("orbits --rows 1000000", "rows must be at most 858993, got 1000000"),
+        (
+            "sweep nu0=0:1:1000000000",
+            "COUNT of axis nu0 must be at most 42949672, got 1000000000",
+        ),
+        (
+            "sweep nu0=0:1:10000 nu1=0:1:10000",
+            "product of all COUNTs must be at most 42949672, got 100000000",
+        ),
+        (
+            "sweep nu0=0:1:20000 nu1=0:1:20000 --out plane.zarr",
+            "product of all COUNTs must be at most 171798691, got 400000000",
+        ),
+        (
+            "sweep nu0=0:1:100000 nu1=0:1:100000 --out plane.zarr --blocks 0:1",
+            "product of all COUNTs must be at most 2147483648, got 10000000000",
+        ),
+    ],
+)
+def test_grids_that_have_no_room_in_memory_are_refused(tmp_path, monkeypatch, words, sentence):
+    monkeypatch.setattr(options, "_memory", lambda: 2**34)
+    monkeypatch.chdir(tmp_path)
+    result = runner.invoke(app, words.split())
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr.startswith(f"Error: {sentence}")
+    assert result.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_grids_that_have_room_are_not_refused(monkeypatch):
+    monkeypatch.setattr(options, "_memory", lambda: 2**34)
+    options.check_count("points", 6553, 2, sides=2)
+    with pytest.raises(ValueError, match=r"at most 6553, got 6554: .* \(16 GiB, 400 bytes each\)$"):
+        options.check_count("points", 6554, 2, sides=2)
+    monkeypatch.undo()
+    assert options._memory() > 2**28
 
 
 def test_a_run_that_is_cut_short_is_written_and_exits_with_1(tmp_path, monkeypatch):

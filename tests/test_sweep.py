@@ -2,6 +2,7 @@
 
 import ast
 import functools
+import json
 import sys
 from dataclasses import replace
 from types import SimpleNamespace
@@ -298,6 +299,8 @@ def test_the_command_writes_data_and_a_picture(tmp_path):
     kept = tmp_path / "plane.zarr"
     done = runner.invoke(app, ["sweep", *axes, "--out", str(kept)])
     assert done.exit_code == 0 and xr.open_zarr(kept).kind.equals(written.kind)
+    done = runner.invoke(app, ["sweep", *axes, "--out", str(kept), "--json"])
+    assert json.loads(done.stdout)["status"] == {"ok": 4}
     done = runner.invoke(app, ["verify", str(kept)])
     assert done.exit_code == 0 and "1 blocks right, 0 to do, 0 bad; finished" in done.output
     (kept / "period" / "c" / "0" / "0").write_bytes(b"nothing")

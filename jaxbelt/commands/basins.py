@@ -12,7 +12,7 @@ from .options import (
     Interval,
     Json,
     Out,
-    check_least,
+    check_count,
     check_range,
     from_to,
     outputs,
@@ -30,7 +30,11 @@ def basins(
     x1: Annotated[Interval, from_to("Displacements of the starts.")] = (0.0, 3.0),
     x2: Annotated[Interval, from_to("Velocities of the starts.")] = (-1.0, 1.0),
     points: Annotated[
-        int, typer.Option(help="Starts along each side of the grid; their square is run.")
+        int,
+        typer.Option(
+            help="Starts along each side of the grid; their square is run, at most as many as "
+            "there is memory for."
+        ),
     ] = 201,
     starts: Annotated[
         int, typer.Option(help="Random starts for the basin stability of the window; 0: none.")
@@ -60,9 +64,8 @@ def basins(
       --damping 0.1 --x1 -2 2 --x2 0 2
     """
     with plain_errors():
-        check_least("points", points, 2)
-        if starts < 0:
-            raise ValueError(f"starts must be 0 or more, got {starts}")
+        check_count("points", points, 2, sides=2)
+        check_count("starts", starts, 0)
         check_range("x1", x1)
         check_range("x2", x2)
         written = outputs(out, ".png", ".csv", ".nc")

@@ -10,13 +10,14 @@ import jaxbelt as jb
 
 from .description import Description, describes
 from .options import (
+    BYTES_OF_ROW,
     Interval,
     Json,
     Out,
     Vary,
     VarySpan,
     as_json_value,
-    check_least,
+    check_count,
     check_range,
     check_word,
     option,
@@ -91,7 +92,7 @@ def diagram(
     - jaxbelt diagram --file machine.toml --vary "belts[0].velocity" --span 0.05 0.3
     """
     with plain_errors():
-        check_least("rows", rows, 1)
+        check_count("rows", rows, 1, each=BYTES_OF_ROW)
         if quantity is not None:
             check_word("quantity", quantity, DRAWABLE)
         check_range("span", span)

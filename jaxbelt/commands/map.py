@@ -9,10 +9,11 @@ import jaxbelt as jb
 
 from .description import Description, describes
 from .options import (
+    BYTES_OF_CELL,
     Interval,
     Json,
     Out,
-    check_least,
+    check_count,
     check_range,
     from_to,
     outputs,
@@ -37,7 +38,10 @@ def region_map(
     ] = ("nu0", "nu1"),
     p: Annotated[Interval, from_to("Values of the first one.")] = (-0.7, 0.7),
     q: Annotated[Interval, from_to("Values of the second one.")] = (-0.7, 0.7),
-    cells: Annotated[int, typer.Option(help="Cells along each side, about.")] = 200,
+    cells: Annotated[
+        int,
+        typer.Option(help="Cells along each side, about; at most as many as there is memory for."),
+    ] = 200,
     out: Out = Path("map"),
     as_json: Json = False,
 ) -> None:
@@ -65,7 +69,7 @@ def region_map(
     with plain_errors():
         described.refuse_machine("map")
         described.check_axes(axes)
-        check_least("cells", cells, 2)
+        check_count("cells", cells, 2, each=BYTES_OF_CELL, sides=2)
         check_range("p", p)
         check_range("q", q)
         written = outputs(out, ".png", ".csv", "_curves.csv")

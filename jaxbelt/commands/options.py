@@ -115,10 +115,36 @@ def check_out(out: Path) -> None:
         raise OSError(f"out must be a place that can be written to, got {out}") from None
 
 
-def check_least(name: str, value: int, least: int) -> None:
-    """Raises unless an integer is as large as that, or larger."""
+#: Bytes that a run or a sample takes until its results are written (measured: 300).
+BYTES_OF_RUN = 400
+#: The same for a cell of a map (measured: 2,000), and a row of a diagram (measured: 18,000).
+BYTES_OF_CELL, BYTES_OF_ROW = 2_000, 20_000
+
+
+def check_count(
+    name: str, value: int, least: int = 1, *, each: int = BYTES_OF_RUN, sides: int = 1
+) -> None:
+    """Raises unless an integer is as large as that, or larger, and the machine has memory for the
+    results.
+
+    each: bytes of one result; sides: 2 where the results are a square of that side.
+    """
     if value < least:
         raise ValueError(f"{name} must be at least {least}, got {value}")
+    if value**sides * each > (memory := _memory()):
+        most = math.floor((memory / each) ** (1 / sides))
+        raise ValueError(
+            f"{name} must be at most {most}, got {value}: this machine has no memory for more "
+            f"results ({memory / 2**30:.3g} GiB, {each} bytes each)"
+        )
+
+
+def _memory() -> int:
+    """Bytes of memory of this machine; 16 GiB where the system does not tell."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, OSError, ValueError):
+        return 2**34
 
 
 def check_word(name: str, word: str, known: Collection[str]) -> None:

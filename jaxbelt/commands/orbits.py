@@ -12,12 +12,13 @@ import jaxbelt as jb
 
 from .description import Description, describes
 from .options import (
+    BYTES_OF_ROW,
     Json,
     Out,
     Start,
     Vary,
     VarySpan,
-    check_least,
+    check_count,
     check_range,
     check_word,
     outputs,
@@ -83,7 +84,7 @@ def orbits(
     - jaxbelt orbits --file machine.toml --vary "belts[0].normal_force" --span 5 30
     """
     with plain_errors():
-        check_least("rows", rows, 2)
+        check_count("rows", rows, 2, each=BYTES_OF_ROW)
         check_word("quantity", quantity, ("x1", "x2"))
         check_range("span", span)
         further = list(map(parse_start, also or ()))

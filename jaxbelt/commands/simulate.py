@@ -13,7 +13,7 @@ from .options import (
     Out,
     Start,
     as_json_value,
-    check_least,
+    check_count,
     check_number,
     check_word,
     option,
@@ -121,7 +121,7 @@ def simulate(
     - jaxbelt simulate --file machine.toml --start 0.05 0 --t1 4
     """
     with plain_errors():
-        check_least("samples", samples, 2)
+        check_count("samples", samples, 2)
         check_word("formulation", formulation, ("filippov", "switch", "smooth"))
         if t1 is not None:
             check_number("t1", t1)

@@ -12,8 +12,10 @@ import jaxbelt as jb
 from .description import Description, describes
 from .files import FromFile
 from .options import (
+    BYTES_OF_RUN,
     Json,
     Start,
+    check_count,
     check_number,
     check_out,
     check_word,
@@ -48,6 +50,9 @@ VARIABLES_FORCED = {
 ENDS = {"attractor": None, "final": 100.0, "lyapunov": 1000.0}
 #: Variables with a number for each belt: too many for a picture.
 OF_BELTS = ("sticks", "stick_duration", "mode_end")
+#: Bytes of memory that a run of a store takes: where a variable is drawn, and where only the
+#: statuses are counted.
+BYTES_DRAWN, BYTES_COUNTED = 100, 8
 
 
 @describes("system", "belt", "damping", "omega", "force", "file")
@@ -155,6 +160,9 @@ def sweep(
         asked: dict[str, Any] = dict(y0=y0, observe=observe, **tolerances(tolerance))
         if t1 is not None:
             check_number("t1", t1)
+        if not dry_run:
+            each = BYTES_OF_RUN if file.suffix == ".nc" else BYTES_DRAWN if drawn else BYTES_COUNTED
+            check_count("product of all COUNTs", math.prod(map(len, values.values())), each=each)
         if file.suffix == ".nc":
             check_out(file)
         check_out(out.with_suffix(".png"))
@@ -210,8 +218,13 @@ def _of_machine(dataset: Any, source: FromFile, axes: list[str], y0: tuple[float
 
 def _counts_as_data(dataset: Any) -> dict[str, Any]:
     """Number of runs, and how they ended."""
-    statuses = jb.decoded(dataset[["status"]]).status.values.ravel().tolist()
-    counts = {name or "not run": statuses.count(name) for name in sorted(set(statuses))}
+    import numpy as np
+
+    from ..sweeps.datasets import words_of
+
+    statuses, numbers = np.unique(dataset.status.values, return_counts=True)
+    words = words_of(statuses, dataset.status.attrs).tolist()
+    counts = {name or "not run": n for name, n in sorted(zip(words, numbers.tolist(), strict=True))}
     sizes = {str(name): size for name, size in dataset.sizes.items()}
     return {"sizes": sizes, "variables": [str(name) for name in dataset], "status": counts}
 
@@ -227,15 +240,18 @@ def parse_blocks(text: str) -> tuple[int, int]:
 def parse_axis(text: str) -> tuple[str, list[float]]:
     """Parses an axis such as `nu0=-0.7:0.7:512` or `nu1=0.35`: its name and its values."""
     name, equals, words = text.partition("=")
-    parts = words.split(":")
+    parts, count = words.split(":"), 0
     try:
         if equals and len(parts) == 1 and not math.isnan(float(words)):
             return name, [float(words)]
         finite = all(map(math.isfinite, map(float, parts)))
-        if equals and finite and len(parts) == 3 and int(parts[2]) > 0:
-            from ..numerics.spacing import evenly_spaced
-
-            return name, evenly_spaced(float(parts[0]), float(parts[1]), int(parts[2])).tolist()
+        if equals and finite and len(parts) == 3:
+            count = int(parts[2])
     except ValueError:
         pass
-    raise ValueError(f"an axis must be NAME=FROM:TO:COUNT or NAME=VALUE, got {text!r}")
+    if count < 1:
+        raise ValueError(f"an axis must be NAME=FROM:TO:COUNT or NAME=VALUE, got {text!r}")
+    check_count(f"COUNT of axis {name}", count)
+    from ..numerics.spacing import evenly_spaced
+
+    return name, evenly_spaced(float(parts[0]), float(parts[1]), count).tolist()
