@@ -82,7 +82,7 @@ class Store:
 
         part: the first block to do, and the one behind the last; None: all blocks.
         """
-        if _is_complete(path):
+        if _is_finished(path):
             yield cls(path, question, part)
             return
         _check_folder(path)
@@ -379,7 +379,7 @@ def _consolidate(path: Path) -> None:
         zarr.consolidate_metadata(path)
 
 
-def _is_complete(path: Path) -> bool:
+def _is_finished(path: Path) -> bool:
     """Whether there is a store that is finished and has the axes of its question."""
     if not (path / "zarr.json").exists():
         return False

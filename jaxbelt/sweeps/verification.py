@@ -56,11 +56,14 @@ class Verified:
         return draw(self, ax)
 
     def __repr__(self) -> str:
-        bad = f" ({', '.join(map(str, self.bad[:10]))}{', ...' * (len(self.bad) > 10)})"
-        axes = f"; bad axes {', '.join(self.axes)}" if self.axes else ""
+        more = ", ..." * (len(self.bad) > 10)
+        bad = f" ({', '.join(map(str, self.bad[:10]))}{more})" if self.bad else ""
+        if self.axes:
+            bad += f"; bad axes {', '.join(self.axes)}, which the call that made the store "
+            bad += "writes again"
         return (
             f"Verified({len(self.done)} blocks right, {len(self.to_do)} to do, {len(self.bad)} bad"
-            f"{bad if self.bad else ''}{axes}; {'finished' if self.finished else 'not finished'})"
+            f"{bad}; {'finished' if self.finished else 'not finished'})"
         )
 
 
