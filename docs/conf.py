@@ -82,7 +82,7 @@ def take_notebooks() -> None:
         notebook = json.loads(path.read_text(encoding="utf-8"))
         notebook["metadata"].pop("widgets", None)
         for cell in notebook["cells"]:
-            # What is a file of the project lies elsewhere from here.
+            # Links to files of docs/ have another path from the copied notebooks.
             cell["source"] = "".join(cell["source"]).replace("](../docs/", "](../")
             if cell["cell_type"] == "code":
                 cell["outputs"] = [one for one in cell["outputs"] if not _is_widget(one)]
@@ -100,7 +100,7 @@ WIDE = 700
 
 
 def _width(output: dict) -> int:
-    """The columns of pixels of an output's picture, from the header of the PNG; 0: it has none."""
+    """Width in pixels of an output's picture, from the header of the PNG; 0 if there is none."""
     text = "".join(output.get("data", {}).get("image/png", ""))
     return struct.unpack(">I", base64.b64decode(text[:32])[16:20])[0] if text else 0
 
@@ -109,13 +109,13 @@ take_notebooks()
 
 
 def setup(app: Sphinx) -> None:
-    """Adjusts what autodoc makes of annotations."""
+    """Connects the functions that adjust how autodoc shows annotations."""
     app.connect("autodoc-process-signature", shorten)
     app.connect("missing-reference", public_class)
 
 
 def shorten(app, what, name, thing, options, signature: str | None, returns: str | None):
-    """Writes ArrayLike by its name, not as the union of types that it is."""
+    """Shows ArrayLike by its name in signatures, not as the union of types that it is."""
     if not signature:
         return None
     union = stringify_annotation(ArrayLike, "smart")

@@ -1,7 +1,7 @@
 """Draws the pictures of the documentation into docs/pictures: `python docs/draw.py [NAME ...]`.
 
-They are stored, for they take minutes. `gallery` has one function a picture, as its code is shown
-beside it; `bifurcations` draws every kind of bifurcation in one manner.
+Pictures are stored, because drawing takes minutes. The gallery has one function for each picture,
+whose code the page shows beside it; each kind of bifurcation is drawn in the same way.
 """
 
 import sys
@@ -186,7 +186,7 @@ GALLERY += [forced_curves]
 
 
 class Case(NamedTuple):
-    """A kind of bifurcation in one parameter: its oscillators, where it is, and to what sides."""
+    """A kind of bifurcation in one parameter: oscillators, a guess, and values on both sides."""
 
     condition: AbstractCondition
     make: Callable
@@ -228,7 +228,7 @@ def overlapping(sigma1):
 
 
 def beside(sigma1, sigma0, damping, *nu):
-    """Belt 0 touches up to sigma1, belt 1 from sigma0 on: both, or none, in between."""
+    """Belt 0 touches up to sigma1, belt 1 from sigma0 on, so both or none touch in between."""
     law = jb.Conti(1.0, 0.6, 10.0)
     belts = (jb.Belt(nu[0], law, upper=sigma1), jb.Belt(nu[1], law, lower=sigma0))
     return jb.Oscillator(damping, belts)
@@ -328,20 +328,20 @@ def bifurcation(case: Case) -> Figure:
 
 
 def _cycles_at(osc: jb.Oscillator, point: jb.BifurcationPoint, beside: list[jb.Cycle]):
-    """The cycle at a point, those that the attracting ones beside it lead to, the unstable one."""
+    """Cycles at a point: its own, those reached from attracting cycles beside, the unstable one."""
     found = [jb.find_cycle(osc, y0=one.sample(2)[0]) for one in beside]
     found = [point.cycle, *found, jb.unstable_cycle(osc)]
     kept: list[jb.Cycle] = []
     for one in found:
         if int(one.status) == jb.Status.OK:
-            # One that is neutral at the point settles slowly, and is not told to many digits.
+            # A cycle that is neutral at the point converges slowly and is known to few digits only.
             again = any(abs(float(one.x1_max) - float(other.x1_max)) < 1e-2 for other in kept)
             kept += [] if again else [one]
     return kept
 
 
 def _at_the_point(rests: jb.Equilibria) -> jb.Equilibria:
-    """Equilibria; what is neutral is drawn as unstable, whatever rounding says of it."""
+    """Equilibria with neutral ones marked as unstable, so that rounding does not decide."""
     neutral = np.abs(np.asarray(rests.rate)) < 1e-6
     return eqx.tree_at(lambda rows: rows.stable, rests, np.asarray(rests.stable) & ~neutral)
 
@@ -363,7 +363,7 @@ def _window_of(cycles: list[jb.Cycle], rests: list[jb.Equilibria]) -> dict:
 
 
 class ForcedCase(NamedTuple):
-    """A kind of bifurcation of periodic motions: where it is, and to what sides.
+    """A kind of bifurcation of periodic motions: oscillators, a guess, and values on both sides.
 
     start: a state at the phase 0 that leads to the motion at the guess.
     """
@@ -378,19 +378,19 @@ class ForcedCase(NamedTuple):
 
 
 def on_a_belt(nu: float, frequency: float, kinetic: float = 0.6) -> Callable:
-    """A mass on one belt, of the amplitude of the force."""
+    """A mass on one belt, as a function of the amplitude of the force."""
     law = jb.Coulomb(1.0, kinetic)
     return lambda F: jb.Oscillator(0.05, (jb.Belt(nu, law),), forcing=jb.Harmonic(F, frequency))
 
 
 def on_a_cubic_belt(nu: float) -> jb.Oscillator:
-    """A mass that is pushed, on a belt of that velocity with a cubic law."""
+    """A forced mass on a belt of velocity `nu` with a cubic law."""
     belts = (jb.Belt(nu, jb.Cubic(1.5, 1.5, 0.45)),)
     return jb.Oscillator(0.0, belts, forcing=jb.Harmonic(0.05, 1.7))
 
 
 def between_two_belts(frequency: float) -> jb.Oscillator:
-    """A mass that is pushed, between belts that run in opposite directions."""
+    """A forced mass between belts that run in opposite directions."""
     law = jb.Stribeck(1.0, 0.5, 0.3)
     belts = jb.Belt(0.5, law, load=0.2), jb.Belt(-0.5, law, load=0.2)
     return jb.Oscillator(0.05, belts, forcing=jb.Harmonic(1.0, frequency))
@@ -441,7 +441,7 @@ def forced_bifurcation(case: ForcedCase) -> Figure:
 
 
 def _draw_attractor(osc: jb.Oscillator, start: np.ndarray, ax) -> None:
-    """The periodic motion that a start leads to, or, where there is none, a long orbit."""
+    """Draws the periodic motion that a start leads to, or, where there is none, a long orbit."""
     motion = jb.find_cycle(osc, start)
     if int(motion.status) == jb.Status.OK:
         motion.plot(ax)

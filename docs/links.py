@@ -53,7 +53,7 @@ class KeepNumbers(SphinxPostTransform):
                 continue
             parts = re.split(r"(?<!\w)(-?\d[\d.,]*e-\d+|-\d[\d.,]*\d|-\d)(?!\w)", text.astext())
             if len(parts) > 1:
-                # Every other one is a number.
+                # Parts with odd indices are numbers.
                 marked = [
                     nodes.inline("", part, classes=["number"]) if i % 2 else nodes.Text(part)
                     for i, part in enumerate(parts)

@@ -4,8 +4,8 @@ from docutils import nodes
 from latex2mathml.converter import convert
 from sphinx.application import Sphinx
 
-#: Operators as they come, and as they are meant here: bars of an absolute value, close to what is
-#: in them, and the sign of what follows an equality.
+#: Operators as latex2mathml writes them, and their replacements: bars of an absolute value without
+#: space inside, and a minus sign after "=" as a prefix.
 BAR, MINUS = '<mo stretchy="false">&#x0007C;</mo>', "<mo>&#x0003D;</mo><mo>&#x02212;</mo>"
 MEANT = {
     BAR: BAR.replace("<mo", '<mo lspace="0" rspace="0" form="prefix"'),
@@ -31,6 +31,6 @@ def _visit_block(writer, node: nodes.math_block) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """The renderer that conf.py names."""
+    """Adds the renderer of equations that conf.py names."""
     app.add_html_math_renderer("mathml", (_visit_inline, None), (_visit_block, None))
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,7 +1,7 @@
 """Measures what each way to an answer costs, for the page "Which function for which question".
 
-`python docs/measure.py` prints the table and writes it to docs/costs.md. On a quiet machine; it
-takes some minutes, most of them compilation, which begins with an empty cache. With names of
+`python docs/measure.py` prints the table and writes it to docs/costs.md. Run it on a quiet machine;
+it takes some minutes, most of them compilation, which begins with an empty cache. With names of
 functions as arguments only these are measured, and nothing is written.
 """
 
@@ -16,8 +16,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-# Programs kept from other sessions would hide what a first call costs; those of this one are kept,
-# as a user's are.
+# Programs that other sessions cached would hide the cost of a first call; programs of this session
+# are cached, as for a user.
 os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
 KEPT = tempfile.TemporaryDirectory()
 os.environ |= {"JAXBELT_CACHE": "1", "JAXBELT_CACHE_DIR": KEPT.name}
@@ -46,7 +46,7 @@ def nu1(osc):
 
 
 class Question(NamedTuple):
-    """A question, the call that answers it, how many answers it gives, and what these are."""
+    """A question, the call that answers it, and the number and the unit of its answers."""
 
     name: str
     asked: str
@@ -91,13 +91,13 @@ def frequency(osc):
 
 @functools.cache
 def _sticking():
-    """A motion of two periods that sticks, with forcing."""
+    """A forced motion that sticks and repeats after two periods."""
     return jb.find_cycle(FORCED(1.68), FROM)
 
 
 @functools.cache
 def _doubling():
-    """A point in which motions of twice the period leave others."""
+    """A period doubling of the forced oscillator."""
     return jb.refine(jb.PeriodDoubling(), FORCED, at=1.71)
 
 
@@ -291,14 +291,14 @@ QUESTIONS = [
 
 
 def seconds(call: Callable[[], Any]) -> float:
-    """How long it takes, results included."""
+    """Seconds until a call has returned and its results are computed."""
     start = time.perf_counter()
     jax.block_until_ready(call())
     return time.perf_counter() - start
 
 
 def words(span: float) -> str:
-    """A time with two digits, in a unit that suits it, from which no line is broken."""
+    """A time with two digits, in a unit that suits it, with a space that does not break lines."""
     units = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
     unit = next((unit for unit, size in units.items() if span >= size), "us")
     value = span / units[unit]
@@ -312,7 +312,7 @@ def shown(name: str) -> str:
 
 
 def measured(question: Question) -> str:
-    """A row of the table."""
+    """Measures a question and returns its row of the table."""
     first = seconds(question.call)
     again = min(seconds(question.call) for _ in range(3 if first < 30 else 2))
     each = words(again / question.answers) if question.answers > 1 else ""
@@ -322,7 +322,7 @@ def measured(question: Question) -> str:
 
 
 def main(names: list[str]) -> None:
-    """Prints the table; writes it if it is whole."""
+    """Prints the table; writes it unless names choose a part."""
     lines = [
         "{.costs}",
         "| function | answer | first call | again | each |",

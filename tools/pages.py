@@ -1,10 +1,10 @@
 """Checks the built documentation: `python -m tools.pages SITE`.
 
 Every public name has a page with its signature and an example; enumerations list their members;
-notebooks and theory have their pictures; no link is dead; nothing comes from the network. All of it
-is read from the HTML. Where chromium is there, every page is also opened in it, as wide as a phone
-and as a desktop screen: every picture has to load, every signature to be seen, what is wider
-than the screen has to scroll by itself, and no request may leave the site.
+notebooks and theory have their pictures; no link is dead; nothing comes from the network. These
+checks read the HTML. Where chromium is installed, every page is also opened in it, as wide as a
+phone and as a desktop screen: every picture has to load, every signature has to be visible, what is
+wider than the screen needs its own scroll bar, and no request may leave the site.
 """
 
 import contextlib
@@ -28,12 +28,12 @@ import jaxbelt
 ROOT = Path(__file__).parents[1]
 #: Widths of a phone and of a desktop screen, in pixels.
 WIDTHS = (390, 1280)
-#: What a browser may take for all pages, in seconds.
+#: Seconds that the browser may take for all pages.
 PATIENCE = 240.0
 
 
 class Page(HTMLParser):
-    """What is looked for in a page: ids, links, pictures, sources, signatures, text."""
+    """Contents of a page: ids, links, pictures, sources, signatures, number of examples, text."""
 
     def __init__(self, path: Path):
         super().__init__()
@@ -68,7 +68,7 @@ class Page(HTMLParser):
 
 
 def faults(site: Path) -> list[str]:
-    """What is wrong, by the HTML."""
+    """Faults of the built site that its HTML shows, a line each."""
     pages = {path: Page(path) for path in sorted(site.rglob("*.html"))}
     wrong = [*_public_names(pages), *_pictures(site, pages)]
     for path, page in pages.items():
@@ -158,7 +158,7 @@ const load = url => new Promise(done => { frame.onload = done; frame.src = url; 
 
 
 def faults_in_browser(site: Path, browser: str) -> list[str]:
-    """What is wrong, as a browser shows the pages."""
+    """Faults of the site that a browser finds when it shows the pages, a line each."""
     names = [path.relative_to(site).as_posix() for path in sorted(site.rglob("*.html"))]
     probe = PROBE.replace("PAGES", json.dumps(names)).replace("WIDTHS", json.dumps(WIDTHS))
     told: queue.Queue[list[str]] = queue.Queue()
@@ -211,7 +211,7 @@ def _opened(browser: str, profile: str, address: str):
 
 
 def main(folder: str) -> int:
-    """Prints what is wrong; the number of faults, at most 1, is the exit code."""
+    """Prints all faults of the site in a folder; returns the exit code, 1 if there are any."""
     site = Path(folder).resolve()
     wrong = faults(site)
     browser = shutil.which("chromium")

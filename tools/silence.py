@@ -1,10 +1,10 @@
 """How long a call may leave somebody at a terminal, or at a notebook, without a sign of life.
 
-`python -m tools.silence` calls what may take long, each function in a process of its own, in which
-nothing was compiled before, and then once more; names choose among them, and `--notebook` asks a
-kernel of Jupyter (the group `notebooks`) in place of a pseudo-terminal. What changes on the screen
-is stamped with the time at which it comes. Told are the seconds that a call takes, and the longest
-time between two changes, its beginning and its end among them.
+`python -m tools.silence` calls each function that may take long twice in its own process, in which
+nothing was compiled before the first call. Names choose functions, and `--notebook` runs them in a
+kernel of Jupyter (the group `notebooks`) instead of a pseudo-terminal. Every change on the screen
+gets a time stamp. The table shows the seconds that a call takes, and the longest time between two
+changes, where the beginning and the end of the call count as changes.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from itertools import pairwise
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-#: What is called, by name.
+#: Source of the calls, by the name of the function.
 CALLS = {
     "simulate": "jb.simulate(osc, (3.0, 0.0), 100.0)",
     "find_cycle": "jb.find_cycle(osc, (3.0, 0.0))",
@@ -69,7 +69,7 @@ row, box = np.linspace(-3.0, 3.0, 200), ((-2.0, 2.0), (-1.0, 1.0))
 square = lambda n: dict.fromkeys(("nu0", "nu1"), np.linspace(-0.7, 0.7, n))
 end = lambda nu: jb.simulate(jb.presets.class_b(nu, 0.35), (3.0, 0.0), 30.0).ys[-1]
 """
-#: What a call needs beside it, computed before it begins.
+#: Source of what a call needs, run before the call, by the name of the function.
 NEEDED = {
     "finite_time_stability": "basins = jb.basins(osc, x1=row, x2=row)",
     **dict.fromkeys(
@@ -96,13 +96,13 @@ CONTROL = re.compile(r"\x1b\[[0-9;?]*[a-zA-Z]|[\r\n]")
 
 
 def longest(times: Iterable[float]) -> tuple[float, float]:
-    """The longest time between two of them, and when it began."""
+    """Longest interval between successive times, and its beginning, counted from the first time."""
     times = list(times)
     return max((after - before, before - times[0]) for before, after in pairwise(times))
 
 
 def told(name: str, turn: str, times: list[float]) -> str:
-    """A line of the table; times: of the beginning, each change on the screen, and the end."""
+    """A line of the table; times: of the call's beginning, each change on the screen, the end."""
     gap, at = longest(times)
     return f"{name:20} {turn:6} {times[-1] - times[0]:8.2f} {gap:8.2f} {at:8.2f} {len(times) - 2:8}"
 
@@ -121,7 +121,7 @@ for _ in range(2):
 
 
 def on_terminal(name: str) -> list[str]:
-    """What a terminal shows of a call, the first and the second one in a process."""
+    """Runs a call twice in one process at a pseudo-terminal; returns both lines of the table."""
     here, there = pty.openpty()
     told_by, pipe = os.pipe()
     program = CHILD.format(pipe=pipe, before=BEFORE + NEEDED.get(name, ""), call=CALLS[name])
@@ -167,7 +167,7 @@ def _lines(name: str, stamps: list[float], changes: list[float]) -> list[str]:
 
 
 def in_notebook(name: str) -> list[str]:
-    """What a kernel sends to be shown of a call; the first and the second one in it."""
+    """Runs a call twice in one kernel of Jupyter; returns both lines of the table."""
     from jupyter_client.manager import start_new_kernel
 
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}

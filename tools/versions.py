@@ -1,10 +1,10 @@
 """Builds the package and tests the wheel: on every Python, and with the oldest dependencies.
 
 `python -m tools.versions`, with `uv` installed (the group `release`), before a release. The wheel
-is built from the source distribution, and the tests are those of the latter, without the package's
-source beside them: what they import is what was installed. Names of environments as arguments
-choose among them. A part of the tests is run, of what depends on other packages most; with
-`--whole` all that the test command of the README runs, but for the tests of the source itself.
+is built from the source distribution. The tests are those of the source distribution, without the
+package's source beside them, so that they import the installed wheel. Names of environments as
+arguments choose among them. By default only those tests run that depend most on other packages;
+with `--whole` all that the README's test command runs, except the tests of the source itself.
 """
 
 import argparse
@@ -18,7 +18,7 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-#: By name, the version of Python, and which versions of the dependencies are taken.
+#: Environments by name: version of Python, and uv's choice of versions of the dependencies.
 ENVIRONMENTS = {
     "oldest": ("3.11", "lowest-direct"),
     "3.11": ("3.11", "highest"),
@@ -29,14 +29,14 @@ PART = "cli clusters explorer machine messages modes parameters plotting results
 
 
 def run(*command: str | Path, cwd: Path) -> int:
-    """Shows a command and runs it; PYTHONPATH would put other code in the way."""
+    """Prints a command, runs it without PYTHONPATH (other code), and returns its exit code."""
     print("==", *command, flush=True)
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     return subprocess.run(command, cwd=cwd, env=environment).returncode
 
 
 def built(folder: Path) -> tuple[Path, Path]:
-    """The wheel, and the files of the source distribution without the package."""
+    """Paths of the wheel and of the unpacked source distribution without the package, both new."""
     if run("uv", "build", "--quiet", "--out-dir", folder, cwd=ROOT):
         sys.exit("it cannot be built")
     (archive,), (wheel,) = folder.glob("*.tar.gz"), folder.glob("*.whl")
@@ -48,14 +48,14 @@ def built(folder: Path) -> tuple[Path, Path]:
 
 
 def tested(name: str, wheel: Path, source: Path, tests: list[str]) -> bool:
-    """Whether the wheel can be installed and used alone there, and the tests pass."""
+    """Whether the wheel can be installed and used alone in an environment, and the tests pass."""
     version, resolution = ENVIRONMENTS[name]
     environment = source.parent / name
     python = environment / "bin" / "python"
     install = ("uv", "pip", "install", "--quiet", "--python", python, "--resolution", resolution)
     steps = [
         ("uv", "venv", "--quiet", "--no-python-downloads", "--python", version, environment),
-        # What is named is direct: the bounds of the project, and then the wheel without any.
+        # `lowest-direct` is for named packages: those of pyproject.toml, then the wheel alone.
         (*install, "-r", "pyproject.toml"),
         (*install, "--no-deps", wheel),
         (environment / "bin" / "jaxbelt", "simulate", "--t1", "10", "--out", "run"),
@@ -66,7 +66,7 @@ def tested(name: str, wheel: Path, source: Path, tests: list[str]) -> bool:
 
 
 def main() -> None:
-    """Ends with 1 unless every environment that was asked for passes."""
+    """Tests the chosen environments; exits with 1 unless all of them pass."""
     # A shell's background jobs ignore interrupts, and so would the tests that send some.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])

@@ -101,7 +101,7 @@ def basins(
 
 
 def _shares_as_data(found: "jb.Basins") -> dict[str, Any]:
-    """Fractions of the grid, by the words for their attractors."""
+    """Fractions of the starts of the grid by the name of their attractor, for JSON."""
     labels = found.label.values
     shares = {name: float((labels == i).mean()) for i, name in enumerate(found.attractors)}
     return {"attractors": shares, "undecided": float((labels < 0).mean())}

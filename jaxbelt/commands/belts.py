@@ -1,4 +1,4 @@
-"""Belts and forces as words of the command line, for `--belt` and `--force`."""
+"""Belts and forces from words of the command line, the values of `--belt` and `--force`."""
 
 import math
 
@@ -40,7 +40,7 @@ def parse_belt(text: str) -> "jb.Belt":
 
 
 def _check_numbers(text: str, friction: dict[str, float], numbers: dict[str, float]) -> None:
-    """Raises where a belt or its law would refuse these numbers; these check only once imported."""
+    """Raises where `Belt` or the law would refuse these numbers, but without importing them."""
 
     def fits(name: str, holds: bool, expected: str, came: float) -> None:
         if not holds:
@@ -61,7 +61,7 @@ def _check_numbers(text: str, friction: dict[str, float], numbers: dict[str, flo
 
 
 def parts_of_belt(text: str) -> tuple[str, dict[str, float], dict[str, float]]:
-    """Class of the law, its arguments, and those of the belt."""
+    """Name of the class of the law, the arguments of the law, and those of the belt."""
     velocity, *parts = text.split(",")
     words = dict.fromkeys(["velocity"], velocity)
     for part in parts:

@@ -25,9 +25,9 @@ CLASSES = {
     "c": {"nu0": 0.2, "nu1": 0.4, "sigma": 0.8},
     "d": {"nu0": 0.2, "nu1": 0.4, "sigma0": 0.5, "sigma1": 1.0},
 }
-#: Arguments of classes that are edges: of two belts, or of one.
+#: Arguments of classes that are contact edges: sigma of both belts, the others of one.
 EDGES = ("sigma", "sigma0", "sigma1")
-#: The start where none is given, dimensionless.
+#: Default start, dimensionless.
 FIRST_STATE = (3.0, 0.0)
 
 
@@ -123,7 +123,7 @@ class Description:
         return has_clock(self.source.own)
 
     def dimensionless(self, value: float, quantity: str) -> float:
-        """A number of the options, in SI units with a machine, in the units of the oscillator.
+        """Converts a number of the options, in SI units with a machine, to the oscillator's units.
 
         quantity: a field of `Units`, such as "length".
         """
@@ -154,9 +154,9 @@ class Description:
         return () if self.belt or self.file else tuple(CLASSES[self.system])
 
     def check(self, *varied: str) -> None:
-        """Raises unless the options describe belts; the classes themselves check numbers.
+        """Raises unless the options fit together; constructors of the package check the numbers.
 
-        varied: parameters that vary. An edge of class (c) or (d) among them is an argument, too.
+        varied: parameters that vary. Contact edges of class (c) or (d) among them count as given.
         """
         if self.source:
             return
@@ -177,7 +177,7 @@ class Description:
                 raise ValueError(f"class {self.system} must have only {known}, got {name}")
 
     def check_parameter(self, name: str) -> None:
-        """Raises unless belts are described, and the parameter that is to vary is known."""
+        """Raises unless the options fit together and the parameter to vary exists."""
         self.check(name)
         paths, short = self.parameters(), self.short_names
         if name not in (*short, *paths):
@@ -187,7 +187,8 @@ class Description:
     def path_along(self, name: str, span: Interval) -> tuple[Any, Any, Interval]:
         """Oscillator, `where` and span of a path in a parameter, as the package takes them.
 
-        For an argument of a class that is no number of the oscillator it is a function, and None.
+        For an argument of a class that is no leaf of the oscillator, such as sigma, the first is a
+        function of the argument that returns the oscillator, and `where` is None.
         """
         path = self.parameters().get(name)
         if path is None:
@@ -202,8 +203,8 @@ class Description:
         return osc, lambda osc: jax.tree.leaves(osc)[place], (first / size, last / size)
 
     def check_ends(self, axes: Mapping[str, Sequence[float]]) -> None:
-        """Raises where the first or the last value of a parameter of a file is impossible, whatever
-        the others that vary are."""
+        """Raises if the first or last value of a parameter of a file is impossible with all
+        combinations of first and last values of the other axes."""
         if self.source is None:
             return
         ends = {name: (values[0], values[-1]) for name, values in axes.items()}
@@ -217,7 +218,7 @@ class Description:
                     raise ValueError(errors[0])
 
     def _error_at(self, values: dict[str, float]) -> str:
-        """What is wrong with values of parameters of a file, "" where nothing is."""
+        """Message of the error that parameter values of a file raise; "" if they are valid."""
         assert self.source is not None
         try:
             self.source.check(values)
@@ -226,13 +227,13 @@ class Description:
         return ""
 
     def unit(self, name: str) -> tuple[str, float]:
-        """Unit of a parameter of a machine, and the size of one unit of the oscillator in it."""
+        """Unit of a parameter of a machine, and the size of the oscillator's unit in it."""
         return self.source.unit(name) if self.machine and self.source else ("", 1.0)
 
     def check_axes(self, axes: Iterable[str], others: tuple[str, ...] = ()) -> None:
         """Raises unless all axes are known and different.
 
-        Known are arguments of the class, parameters of what is described, and `others`.
+        Axes may be arguments of the class, parameters of the oscillator or machine, and `others`.
         """
         self.check()
         paths = self.parameters()
@@ -256,15 +257,15 @@ class Description:
         return _parameters(self.system, self.belt, self.force)
 
     def oscillator(self, **values: Any) -> "jb.Oscillator":
-        """The oscillator; values: what differs from the options, as for `oscillator`."""
+        """The oscillator; values: by name, they replace those of the options (see `oscillator`)."""
         if self.source:
             return self.source.at(**values)
         given = {**self.arguments, **values}
         return oscillator(self.system, self.belt, self.damping, self.omega, self.force, **given)
 
     def along(self, axes: Iterable[str]) -> "Callable[..., jb.Oscillator]":
-        """The oscillator as a function of its axes; the function's text, which datasets keep, can
-        be run."""
+        """The oscillator as a function of its axes; datasets store the text of the function, which
+        can be run in any program."""
         if self.source:
             return functools.partial(oscillator_of, self.source.data)
         rest: dict[str, Any] = {"damping": self.damping, "omega": self.omega}
@@ -281,9 +282,9 @@ class Description:
 
 
 def describes(*names: str) -> Callable:
-    """Decorator of a command: options with these names stand in place of its parameter `described`.
+    """Decorator of a command: options with these names replace its parameter `described`.
 
-    The command gets a `Description`. Without names all fields of one are options.
+    The command gets them as a `Description`. Without names all fields of `Description` are options.
     """
     options = [
         inspect.Parameter(
@@ -304,7 +305,7 @@ def describes(*names: str) -> Callable:
             values = {one.name: given.pop(one.name) for one in options}
             return command(described=Description(**values), **given)
 
-        # By which typer knows the options.
+        # typer reads the options from the signature and the annotations.
         vars(call)["__signature__"] = inspect.Signature(own)
         call.__annotations__ = {one.name: one.annotation for one in own}
         return call
@@ -364,7 +365,7 @@ def _given(arguments: dict[str, Any]) -> dict[str, Any]:
 
 
 def names_in_words(names: Iterable[str], paths: dict[str, str]) -> str:
-    """Possible names of a parameter: the short ones, or one of many paths."""
+    """Names that a parameter may have, for messages: the short ones, and two paths as examples."""
     short = dict.fromkeys(
         [*names, *(name for name in paths if "." not in name and paths[name] != name)]
     )

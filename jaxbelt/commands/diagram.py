@@ -139,7 +139,7 @@ def diagram(
 def points_of(points: "tuple[jb.BifurcationPoint, ...]", unit: str, size: float) -> dict[str, Any]:
     """Columns value, kind, belts, type, error and status, a row for each bifurcation point.
 
-    unit: that of the parameter, and size its size.
+    unit: unit of the parameter. size: size of the oscillator's unit of the parameter in it.
     """
     return {
         headed("value", unit): [float(point.value) * size for point in points],

@@ -1,9 +1,9 @@
 """An oscillator, or a machine in SI units, from a TOML file, for `--file`.
 
-Keys of the file are arguments of the classes: of `Machine` and `PhysicalBelt` where there is a mass
-or a stiffness, else of `Oscillator` and `Belt`. A table in place of a velocity or a load is an
-`Oscillating`; `law` and `kind` choose the class of a friction law and of a force. The classes check
-all values; here their messages get the place in the file.
+Keys of the file are arguments of the classes: of `Machine` and `PhysicalBelt` where a mass, a
+stiffness or a normal force is given, else of `Oscillator` and `Belt`. A table in place of a
+velocity or a load is an `Oscillating`; `law` and `kind` choose the class of a friction law and of a
+force. The classes check all values; here their messages get the place in the file.
 """
 
 import copy
@@ -21,12 +21,12 @@ import jaxbelt as jb
 from ..spelling import did_you_mean
 from .belts import LAWS
 
-#: Classes by the words that choose them, for each key of such a word.
+#: Names of classes by the words of the file that choose them, for both keys of such words.
 CLASSES_OF = {
     "law": {name: law for name, (law, _) in LAWS.items()} | {"table": "Tabulated"},
     "kind": {"harmonic": "Harmonic", "base_motion": "BaseMotion"},
 }
-#: Columns of a table of friction.
+#: Columns of a CSV file of friction coefficients.
 COLUMNS = ("speed", "mu")
 
 
@@ -41,19 +41,19 @@ class Place:
         return f"{self.path} in {self.file}" if self.path else self.file
 
     def at(self, key: str | int) -> "Place":
-        """The place of an entry."""
+        """The place of an entry of the table or list at this place."""
         step = f"[{key}]" if isinstance(key, int) else f".{key}" if self.path else key
         return Place(self.file, self.path + step)
 
     def must(self, expected: str, came: str) -> ValueError:
-        """An error about what is here."""
+        """The error for a wrong value at this place."""
         return ValueError(f"{self} must {expected}, got {came}")
 
     def blamed(self, message: str, table: dict[str, Any]) -> ValueError:
-        """The error of a class that was made from a table here, with the place of the value."""
+        """The error of a class made from the table here, with the place of the wrong value."""
         subject, must, rest = message.partition(" must be ")
         place, inner = self, table
-        # Such as "kinetic of Coulomb", or "mean of load of belt".
+        # Subjects are such as "kinetic of Coulomb", or "mean of load of belt".
         for word in reversed(subject.split(" of ")):
             if isinstance(inner, dict) and word in inner:
                 place, inner = place.at(word), inner[word]
@@ -61,7 +61,7 @@ class Place:
 
 
 def read_file(path: Path) -> dict[str, Any]:
-    """The content of a TOML file, tables of friction included."""
+    """Content of a TOML file, with friction tables read from the CSV files that it names."""
     try:
         with path.open("rb") as file:
             data = tomllib.load(file)
@@ -111,7 +111,7 @@ def read_table(path: Path, place: Place) -> tuple[list[float], list[float]]:
 
 
 def _cells(row: dict[Any, Any]) -> list[Any]:
-    """Speed and coefficient of a row; of one with more cells than columns all cells."""
+    """Speed and coefficient of a row, followed by its cells beyond the last column, if any."""
     cells = [row[name] for name in COLUMNS]
     return [*cells, *row[None]] if None in row else cells
 
@@ -136,7 +136,7 @@ def described_by(data: dict[str, Any], file: str) -> "jb.Machine | jb.Oscillator
     return _object(whole, data, top, {"belts": as_belts, "forcing": as_forcing})
 
 
-#: What makes the objects in a table, by key.
+#: Functions that make the objects in a table, by key; arguments: the value and its place.
 Makers = dict[str, Callable[[Any, Place], Any]]
 
 
@@ -145,7 +145,7 @@ def _object(
 ) -> Any:
     """An object of a class from a table of its arguments.
 
-    choice: the key that has chosen the class, which is no argument.
+    choice: the key that chose the class and is not one of its arguments; "" if there is none.
     """
     _, *arguments = inspect.signature(vars(kind)["__init__"]).parameters.values()
     known = [*([choice] if choice else []), *(one.name for one in arguments)]
@@ -176,7 +176,7 @@ LISTS = ("belts", "forcing", "speeds", "coefficients")
 
 
 def _of_choice(key: str, table: Any, place: Place, default: str | None = None) -> Any:
-    """An object of the class that a word of its table chooses."""
+    """An object from a table, of the class that the table's word at `key` chooses."""
     known = CLASSES_OF[key]
     if not isinstance(table, dict):
         raise place.must(f"be a table with the key {key}", repr(table))
@@ -194,7 +194,7 @@ def _as_wave(value: Any, place: Place) -> Any:
 
 
 def _tables(value: Any, place: Place) -> Iterator[tuple[dict[str, Any], Place]]:
-    """The tables of an array, or a single one."""
+    """Tables of an array, each with its place; a single table counts as an array of one."""
     tables = [value] if isinstance(value, dict) else value
     if not (isinstance(tables, list) and all(isinstance(one, dict) for one in tables)):
         raise place.must(f"be tables, [[{place.path}]]", repr(value))
@@ -222,7 +222,7 @@ class FromFile:
         from ..model.parameters import names_of
 
         self.data, self.file = data, file
-        # Known numbers stay known where a program is traced.
+        # Numbers of the file stay concrete if this runs while a program is traced.
         with jax.ensure_compile_time_eval():
             found: Any = described_by(data, file)
             self.machine = found if isinstance(found, jb.Machine) else None
@@ -237,13 +237,13 @@ class FromFile:
         self.paths = {}
         for name in names_of(self.machine):
             path = name.replace(".normal_force", ".load")
-            # A law without a unit of its own is wrapped.
+            # A law without a unit of speed is inside a `LawInUnits`.
             for one in (path, path.replace(".friction.", ".friction.law.")):
                 if one in names:
                     self.paths[name] = one
 
     def unit(self, name: str) -> tuple[str, float]:
-        """Unit of a parameter in the file, and the size of 1 in the oscillator's units."""
+        """Unit of a parameter in the file, and the size of the oscillator's unit in it."""
         if self.machine is None:
             return "", 1.0
         import jax
@@ -254,7 +254,7 @@ class FromFile:
             return unit_of(self.paths[name], self.own, self.machine.units)
 
     def check(self, values: dict[str, float]) -> None:
-        """Raises in the words of the file where values of parameters are impossible together."""
+        """Raises if the values are impossible together; the error names the place in the file."""
         data = copy.deepcopy(self.data)
         for name, value in values.items():
             path = name if self.machine else self.paths[name]
@@ -269,18 +269,18 @@ class FromFile:
         described_by(data, self.file)
 
     def at(self, **values: Any) -> "jb.Oscillator":
-        """The dimensionless oscillator with parameters set, in the units of the file."""
+        """The dimensionless oscillator with parameters set to values in the units of the file."""
         scaled = {self.paths[name]: value / self.unit(name)[1] for name, value in values.items()}
         return changed(self.own, scaled)
 
 
 def oscillator_of(data: dict[str, Any], **values: Any) -> "jb.Oscillator":
-    """The dimensionless oscillator of a file with this content, parameters set in its units."""
+    """Dimensionless oscillator of a file's content; values: parameters in the file's units."""
     return FromFile(data, "the file").at(**values)
 
 
 def changed(osc: "jb.Oscillator", values: dict[str, Any]) -> "jb.Oscillator":
-    """The oscillator with the parameters of these paths set."""
+    """The oscillator with the parameters at these paths set to the values, checked."""
     import jax
 
     from ..checks import as_array

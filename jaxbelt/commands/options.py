@@ -1,7 +1,7 @@
 """What the commands share: checks of their options, errors in one sentence, what they print.
 
-Neither this module nor those of the commands import what computes before it is used. So help, and
-mistakes in the options, appear at once.
+This module and the commands import JAX and the numerical modules only when they compute. So help
+and messages about wrong options appear at once.
 """
 
 import json
@@ -28,7 +28,7 @@ from ..spelling import did_you_mean
 
 @contextmanager
 def plain_errors() -> Iterator[None]:
-    """Prints an error of the user as its one sentence and exits with code 2.
+    """Prints a user's error in one sentence, without a traceback, and exits with code 2.
 
     An interrupt exits with code 130, as in shells.
     """
@@ -148,14 +148,14 @@ def _memory() -> int:
 
 
 def check_word(name: str, word: str, known: Collection[str]) -> None:
-    """Raises unless a word is one of those that are known; suggests one."""
+    """Raises unless a word is one of `known`; the message suggests a similar one."""
     if word not in known:
         meant = did_you_mean(word, known)
         raise ValueError(f"{name} must be one of {', '.join(known)}, got {word}{meant}")
 
 
 def check_number(name: str, value: float) -> None:
-    """Raises unless a number is finite and > 0, like the package itself, but before it is
+    """Raises unless a number is finite and > 0; so does the package, but only once it is
     imported."""
     if not 0 < value < math.inf:
         raise ValueError(f"{name} must be finite and > 0, got {value}")
@@ -166,10 +166,10 @@ LOOSEST = 1e-2
 
 
 def tolerances(value: float | None) -> dict[str, float]:
-    """The arguments rtol and atol for the option `--tolerance`; none, where it is not given.
+    """Arguments rtol and atol for the value of `--tolerance`; empty for None.
 
     Raises:
-        ValueError: If an integrator cannot be asked for it.
+        ValueError: If the tolerance is not positive or larger than LOOSEST.
     """
     if value is None:
         return {}
@@ -186,13 +186,13 @@ def check_range(name: str, ends: tuple[float, float]) -> None:
 
 
 def make_console() -> Console:
-    """A console; in a file, which has no width, it does not fold lines."""
+    """A console as wide as the terminal; 200 letters wide where the output is no terminal."""
     console = Console()
     return console if console.is_terminal else Console(width=200)
 
 
 def steps_bar(console: Console, width: int, hidden: bool) -> Progress:
-    """A bar of steps with their names, of a width in letters."""
+    """A progress bar for named steps; width: letters of a name. hidden: shows nothing."""
     name = TextColumn(f"{{task.description:<{width}}}")
     columns = name, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     return Progress(*columns, console=console, disable=hidden)
@@ -201,7 +201,7 @@ def steps_bar(console: Console, width: int, hidden: bool) -> Progress:
 def say(
     lines: Iterable[str], written: Iterable[Path] = (), *, as_json: bool, data: dict[str, Any]
 ) -> None:
-    """Prints lines and the files that were written; or `data`, with these, as JSON."""
+    """Prints lines and the paths of written files; as_json: `data` and these paths as JSON."""
     if as_json:
         print(json.dumps({**data, "written": [str(path) for path in written]}))
         return
@@ -212,7 +212,7 @@ def say(
 
 @contextmanager
 def picture(path: Path, width: float, height: float) -> Iterator[Any]:
-    """An empty figure in the style of a journal, size in inches; it is written once drawn."""
+    """An empty figure in journal style, size in inches; saved to `path` when the context ends."""
     from ..plotting.style import journal_figure, journal_style, save
 
     with journal_style():
@@ -264,7 +264,7 @@ def from_to(text: str) -> Any:
 
 
 def tolerance_of(default: str) -> Any:
-    """Option of the tolerance of a step; default: of the relative one."""
+    """Option of the tolerances of a step; default: the relative one, in words."""
     text = "Relative and absolute tolerance of the integrator; of a machine the latter is in "
     return option(f"{text}max N / k.", f"{default}, the absolute one of the oscillator's own size")
 

@@ -150,7 +150,7 @@ def simulate(
         from ..plotting.style import journal_style, save
 
         out.parent.mkdir(parents=True, exist_ok=True)
-        # With a clock a state that comes back is not yet a motion that repeats.
+        # With a clock a state may recur at another phase: that is not yet a periodic motion.
         cycle = None if has_clock(osc) else steady_cycle(trajectory)
         with journal_style():
             figure = draw_overview(osc, trajectory, cycles=[cycle] if cycle else [])
@@ -177,7 +177,7 @@ def simulate(
 def columns_of_samples(trajectory: "jb.Trajectory", found: Any = None) -> dict[str, Any]:
     """Columns t, x1, x2 and the contact code of every belt, a row for each sample.
 
-    found: the trajectory in SI units; then the columns have units, and there is the friction.
+    found: the trajectory in SI units; columns then have units, and the friction force is added.
     """
     columns = dict(t=trajectory.ts, x1=trajectory.ys[:, 0], x2=trajectory.ys[:, 1])
     if found is not None:
@@ -187,7 +187,7 @@ def columns_of_samples(trajectory: "jb.Trajectory", found: Any = None) -> dict[s
 
 
 def columns_of_events(trajectory: "jb.Trajectory", found: Any = None) -> dict[str, Any]:
-    """Columns t, x1, x2, kind and belt, a row for each event; found: as above."""
+    """Columns t, x1, x2, kind and belt, a row for each event; found: see `columns_of_samples`."""
     events = trajectory.events
     columns = dict(t=events.t, x1=events.y[:, 0], x2=events.y[:, 1])
     if found is not None:

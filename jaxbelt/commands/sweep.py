@@ -28,7 +28,7 @@ from .options import (
     turn_on_float64,
 )
 
-#: Values of `--observe`: the variables of the dataset, and the default variable of the picture.
+#: Variables of the dataset by the value of `--observe`; the picture shows the first by default.
 VARIABLES = {
     "attractor": (
         *("kind", "signature", "sticks", "period", "stick_duration", "x1_min", "x1_max"),
@@ -36,7 +36,7 @@ VARIABLES = {
     ),
     "final": ("x1_end", "x2_end", "mode_end", "n_events", "status"),
 }
-#: Likewise with `--force`.
+#: The same for forced oscillators.
 VARIABLES_FORCED = {
     "attractor": (
         *("kind", "periods", "sticks", "period", "stick_duration", "x1_min", "x1_max"),
@@ -154,7 +154,7 @@ def sweep(
         drawn = part is None and sum(len(axis) > 1 for axis in values.values()) in (1, 2)
         check_word("variable", shown, [name for name in known[observe] if name not in OF_BELTS])
         machine = described.machine
-        # A store is complete, and so can be converted, where no blocks are asked for.
+        # Without --blocks the store will be complete, so its dataset can be converted to SI units.
         file = out.with_suffix(".nc") if machine and part is None else out
         y0 = described.start(start)
         asked: dict[str, Any] = dict(y0=y0, observe=observe, **tolerances(tolerance))
@@ -200,7 +200,7 @@ def sweep(
 def _of_machine(dataset: Any, source: FromFile, axes: list[str], y0: tuple[float, float]) -> Any:
     """The dataset of a machine in SI units, with the units of its axes and of its start.
 
-    The parameters vary in the units of the machine in the file.
+    axes: the parameters among the axes; their values are in the units of the file already.
     """
     machine: Any = source.machine
     units = machine.units
@@ -230,7 +230,7 @@ def _counts_as_data(dataset: Any) -> dict[str, Any]:
 
 
 def parse_blocks(text: str) -> tuple[int, int]:
-    """Parses `0:64`: the first block, and the one behind the last."""
+    """Parses `0:64`: number of the first block, and of the one behind the last."""
     first, colon, last = text.partition(":")
     if not (colon and first.isdecimal() and last.isdecimal() and int(first) < int(last)):
         raise ValueError(f"blocks must be FROM:TO, two integers with FROM < TO, got {text!r}")

@@ -27,7 +27,7 @@ def in_columns(dataset: Any, names: Sequence[str]) -> dict[str, Any]:
 
 
 def headed(name: str, unit: str) -> str:
-    """A name with a unit such as "m s-1" behind it."""
+    """Heading of a column: "x2 (m/s)" for the name x2 and the unit "m s-1"."""
     from ..plotting.style import in_fractions
 
     return f"{name} ({in_fractions(unit).replace('$', '')})" if unit not in ("", "1") else name

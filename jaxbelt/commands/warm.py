@@ -16,7 +16,7 @@ from .options import Json, make_console, plain_errors, say, steps_bar, turn_on_f
 
 #: Start of the runs of the commands and of the paper.
 START = (3.0, 0.0)
-#: The paper's path, and few points for other axes: their number is no part of a program.
+#: The paper's span, and few points for other axes: programs do not depend on their number.
 SPAN = (-0.7, 0.7)
 FEW, GRID = 3, [-3.0, 0.0, 3.0]
 
@@ -93,7 +93,7 @@ def jobs() -> list[tuple[str, Callable[[], Any]]]:
         "basins": lambda osc: jb.basins(osc, x1=GRID, x2=GRID, progress=False),
         "portrait": jb.portrait,
     }
-    # Paths need many programs; those of the paper's law are enough.
+    # Paths need many programs, so they are compiled for the paper's law only.
     paths: dict[str, Callable[[Any], Any]] = {
         "scan": lambda osc: jb.scan(osc, where, SPAN),
         "bifurcation_diagram": lambda osc: jb.bifurcation_diagram(osc, where, SPAN),

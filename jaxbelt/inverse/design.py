@@ -43,8 +43,8 @@ from .selection import ITERATIONS, LONGEST_CHANGE, Selection, progress_reporter,
 if TYPE_CHECKING:
     import pandas
 
-#: A target counts as met within this fraction of the larger of what is wanted and what the first
-#: cycle has, of 1 where both are 0.
+#: A target counts as met if the miss is less than this fraction of the target, or of the value of
+#: the first cycle where that is larger; of 1 where both are 0.
 MET = 1e-9
 
 
@@ -57,8 +57,8 @@ class Design(eqx.Module):
         names: Names of the parameters, in the order of `where`.
         values: Their values, [p].
         achieved: Values of the functionals, [targets].
-        targets: What they should be, [targets]: the nearer end of an interval, or the value itself
-            inside of it.
+        targets: Target values, [targets]; for an interval its nearer end, or the achieved value
+            where that is inside.
         iterations: Number of Newton steps.
         status: OK; UNREACHABLE, where the nearest design that was found is returned; or the reason
             why there is no cycle to begin with.
@@ -114,7 +114,7 @@ class Design(eqx.Module):
 
 @dataclass(frozen=True, eq=False)
 class _BifurcationMargin:
-    """What `distance_to` returns."""
+    """The functional that `distance_to` returns."""
 
     conditions: tuple[AbstractCondition, ...]
     where: Callable[[Oscillator], Any]
@@ -181,13 +181,13 @@ def design(
     """Parameters for which functionals of the cycle have given values.
 
     The method is Newton's, damped, with exact derivatives; with fewer targets than parameters it
-    takes the shortest steps. The status is UNREACHABLE where no choice within the bounds that these
-    steps come to meets the targets: the nearest may be best only among those beside it, and targets
-    may lie behind a bifurcation at which the cycle vanishes. Then begin with another oscillator.
+    takes the shortest steps. The status is UNREACHABLE where these steps find no choice within the
+    bounds that meets the targets: the returned design may be the best only locally, and targets may
+    lie behind a bifurcation at which the cycle vanishes. Then begin with another oscillator.
 
-    Of a forced oscillator the cycle is the stable `PeriodicMotion` that y0 leads to. It is
-    followed: each trial begins from the motion of the last one that was accepted. A trial that
-    leads to no periodic motion, as in chaos, is not accepted.
+    For a forced oscillator the cycle is the stable `PeriodicMotion` that y0 leads to. It is
+    followed: each trial starts on the motion of the last accepted trial. A trial that leads to no
+    periodic motion, as in chaos, is not accepted.
 
     Args:
         oscillator: The oscillator to begin with; it needs a cycle.
@@ -221,7 +221,7 @@ def design(
         u = jnp.asarray(u)
         beside = selection.put(oscillator, selection.values(u))
         ready = tuple(f.at(beside, y0) if isinstance(f, BasinMargin) else f for f in functionals)
-        # Forced motions are found outside of programs.
+        # Forced motions are found outside of compiled programs.
         achieved = _achieved if has_clock(oscillator) else _achieved_in_one
         return achieved(ready, selection, oscillator, y0, u)
 
@@ -229,12 +229,12 @@ def design(
         return cycle.start if isinstance(cycle, PeriodicMotion) else y0
 
     def wanted_near(achieved):
-        # Where nothing is achieved a single value is wanted all the same.
+        # Where the achieved value is NaN, only a target that is one value is known.
         single = np.where(np.ptp(intervals, axis=1) == 0, intervals[:, 0], np.nan)
         return np.where(np.isnan(achieved), single, np.clip(achieved, *intervals.T))
 
     def off(achieved):
-        # A distance may be infinite, and wanted so.
+        # A distance may be infinite, and so may its target: then the miss is 0.
         wanted, away = wanted_near(achieved), np.zeros(len(sizes))
         np.subtract(achieved, wanted, where=achieved != wanted, out=away)
         return away / sizes, wanted
@@ -248,7 +248,7 @@ def design(
         return u + step * min(1.0, LONGEST_CHANGE / max(np.max(np.abs(step)), 1e-300))
 
     achieved, slopes, cycle = evaluate(u, y0)
-    # The unit of a miss; of an interval its nearer end counts.
+    # The units of misses; for an interval its nearer end counts.
     known = np.stack([np.asarray(achieved), wanted_near(np.asarray(achieved))])
     largest = np.max(np.abs(np.where(np.isfinite(known), known, 0.0)), axis=0)
     sizes = np.where(largest > 0, largest, 1.0)
@@ -318,13 +318,13 @@ def _check_functional(functional: Callable[[Any], Any], osc: Oscillator) -> None
 
 
 def _motion_of_zeros(osc: Oscillator) -> Callable[[Oscillator], PeriodicMotion]:
-    """As `cycle_of_zeros`, for oscillators like a forced one."""
+    """The counterpart of `cycle_of_zeros` for oscillators with the forcing of `osc`."""
     turns = turns_of(osc)
     return lambda osc: nothing_found(osc, turns, Status.OK.value)
 
 
 def _check_frequencies(osc: Oscillator, selection: Selection, u: np.ndarray) -> None:
-    """Raises a `ValueError` if frequencies that have a period in common are changed apart."""
+    """Raises a `ValueError` if the selection can change the ratio of two frequencies."""
     moved = selection.put(osc, selection.values(jnp.asarray(u + 1e-3 * np.arange(1, u.size + 1))))
     before, after = (np.array(list(map(float, frequencies(one)))) for one in (osc, moved))
     fits = np.allclose(before * after[:1], after * before[:1], rtol=1e-14, atol=0)

@@ -63,8 +63,8 @@ if TYPE_CHECKING:
 JOIN = 3
 #: Candidates with a larger chi^2 per datum in windows are followed last, if no other one fits.
 FAR_OFF = 6.0
-#: A parameter belongs to an undetermined direction if it changes along it by more than this many of
-#: its sizes, per standard error.
+#: A parameter belongs to an undetermined direction if one standard error along that direction
+#: changes it by more than this fraction of its size.
 LEAST_PART = 0.3
 
 
@@ -82,8 +82,9 @@ class Fit(eqx.Module):
         oscillator: The oscillator with the estimates in it.
         names: Names of the parameters, in the order of `where`.
         estimates: Their estimates, [p].
-        standard_errors: Standard errors of the estimates, [p]; 0 of one at a bound beyond which the
-            record would fit better: it is held there, and the others' are those beside it.
+        standard_errors: Standard errors of the estimates, [p]; 0 for a parameter at a bound beyond
+            which the record would fit better: it is held there, and the others' errors are for
+            this fixed value.
         covariance: Covariance of the estimates, [p, p].
         y0: Estimated state (x1, x2) at the first time, [2].
         y0_standard_errors: Its standard errors, [2].
@@ -102,7 +103,7 @@ class Fit(eqx.Module):
             standard error that is infinite, or larger than its parameter and than 0.1 of its unit);
             NO_CONVERGENCE (a further step would move the estimates by a third of a standard error);
             or NOT_FINITE.
-        noise_was_estimated: Whether the noise of a column at least was estimated.
+        noise_was_estimated: Whether the noise of at least one column was estimated.
     """
 
     oscillator: Oscillator
@@ -257,15 +258,15 @@ def fit(
 
     All numbers are dimensionless, as in `simulate`. The state at the first time is estimated, too.
 
-    Of a forced oscillator amplitudes, frequencies and phases are parameters like others. What a
-    record does not tell is when it was begun: fit a phase. A frequency should be known so well that
-    the forcing is not shifted by more than a radian or two in the time of the record.
+    The amplitudes, frequencies and phases of a forced oscillator are parameters like others. A
+    record does not tell at which phase of the forcing it begins: fit a phase. A frequency should be
+    known so well that the forcing is not shifted by more than a radian or two over the record.
 
     Args:
         oscillator: The guess. One that is 30 per cent off is mostly near enough for a stick-slip
             record of many loops. The status MISFIT may mean that it was not: give a nearer one, or
             more starts.
-        ts: Times tau, increasing, [samples]; those of the cosines where there is forcing.
+        ts: Times tau, increasing, [samples]; with forcing, the times in its cosines.
         x1: Displacements, [samples], NaN where a datum is missing; or None.
         x2: Velocities, likewise. One of x1 and x2 has to be given.
         where: Selects the parameters, as in `equinox.tree_at`: one number of the oscillator, or a
@@ -274,10 +275,10 @@ def fit(
         noise: Standard deviation of the data, a pair where both x1 and x2 are given. None estimates
             it from the scatter of neighbouring data about a smooth curve, for which a loop needs
             some tens of data.
-        bounds: For each parameter (lower, upper) or None; None keeps it where the oscillator is
-            possible: what cannot be negative positive, a contact edge on its side of the other one
-            if that is not selected, too. Parameters stay inside by a change of variables, so an
-            estimate at a bound is one that would be outside without it.
+        bounds: For each parameter (lower, upper) or None; None keeps the oscillator possible: a
+            parameter that cannot be negative stays positive, and a contact edge stays on its side
+            of the other one if that is not selected, too. Parameters stay inside by a change of
+            variables, so an estimate at a bound is one that would be outside without it.
         starts: Number of starts of the search, spread about the guess.
         report: Function that is called with lines on the progress, such as `print`.
 
@@ -360,10 +361,10 @@ def _checked_record(ts, x1, x2, noise):
 
 
 def _motions_from(problem, guesses, data: int, note) -> Iterator[FitPoint]:
-    """Motions that the guesses lead to.
+    """Fitted motions, one for each guess.
 
-    First come those whose windows come near the record, then the others, last the motion from the
-    first guess without windows.
+    First come the guesses whose windows come near the record, then the others, last the first guess
+    again, without windows.
     """
     guess, far = next(guesses), []
     for number, (u, starts, misfit) in enumerate(itertools.chain([guess], guesses), 1):
@@ -383,7 +384,7 @@ def _motions_from(problem, guesses, data: int, note) -> Iterator[FitPoint]:
 
 
 def _misfit_of(point: FitPoint) -> float:
-    """chi^2, infinite where it is not finite."""
+    """chi^2 of a point, inf where it is NaN."""
     return float(np.nan_to_num(point.chi2, nan=np.inf))
 
 
@@ -399,7 +400,7 @@ def _in_windows(problem, u, starts, data: int, note) -> FitPoint:
 
 
 def _as_one_motion(problem, point: FitPoint, data: int, note) -> FitPoint:
-    """Joins windows until one is left."""
+    """Joins windows, stage by stage, until one is left."""
     pieces, every = len(point.starts), 1
     while True:
         every = min(JOIN * every, pieces)
@@ -474,7 +475,7 @@ def _result(
 
 
 def _inverted(matrix: np.ndarray) -> np.ndarray:
-    """Inverse of a Gauss-Newton matrix; infinite variances of what is not determined."""
+    """Inverse of a Gauss-Newton matrix; variances of undetermined unknowns are infinite."""
     scale, values, vectors = known_directions(matrix)
     inverse = (vectors / values) @ vectors.T / scale[:, None] / scale
     known = np.sum(vectors**2, axis=1)

@@ -22,8 +22,8 @@ class BasinMargin(eqx.Module):
 
     Attributes:
         direction: Direction of the shock, see `minimal_fatal_shock`.
-        way: Shortest way to the boundary, where the oscillator is known beforehand.
-        otherwise: Value where there is no such way: inf, or NaN for one that is not known.
+        way: Shortest way to the boundary, where `at` has found it for a nearby oscillator.
+        otherwise: Value where `at` found no way: inf without a boundary, NaN where that is unknown.
         length: Unit of length of `way`.
     """
 
@@ -33,9 +33,9 @@ class BasinMargin(eqx.Module):
     length: Array | None = None
 
     def at(self, osc: Oscillator, y0: Array) -> "BasinMargin":
-        """Returns the margin of the cycle that a start of a known oscillator leads to.
+        """Returns the margin of the cycle that a start of a concrete oscillator leads to.
 
-        For oscillators near that one it is a function that JAX can trace.
+        For oscillators near that one the margin is a function that JAX can trace.
         """
         own = in_units_of_run(osc)
         length = own.units.length

@@ -13,10 +13,11 @@ from jaxtyping import Array
 
 from ..model.oscillator import Oscillator, frequencies, has_clock
 
-#: Length of the first windows, less than half a loop: no phase is lost over it. Data count as near
-#: to each other within a third of a time unit. With faster forcing both are shorter.
+#: Length of the first windows, less than half a loop, over which no phase is lost; half the time
+#: that a local cubic spans. Forcing faster than 1 shortens both by its frequency.
 WINDOW, SMOOTHED = 2.5, 0.35
-#: Noise alone makes a fit as bad as this once in a million records.
+#: Plausibility at or below which residuals are no noise: noise alone gets there once in a million
+#: records.
 IMPLAUSIBLE = 1e-6
 #: Residuals with a larger autocorrelation, in units of 1/sqrt(data), are not noise.
 MOST_CORRELATED = 6.0
@@ -33,7 +34,7 @@ class Record(eqx.Module):
         values: x1 and x2, [pieces, samples, 2].
         weights: 1/noise, 0 where there is no datum, [pieces, samples, 2].
         starts: Measured states at the starts of the pieces, [pieces, 2].
-        scale: Scale of each component, [2].
+        scale: Standard deviation of each component of the measured states, [2].
         lacks: 1.0 where only velocities are known, so that the x1 of all starts lack a common
             constant, else 0.0.
         length: Unit of length of all of these.
@@ -64,7 +65,7 @@ def record_of(
         values: x1 and x2, [samples, 2], NaN where there is no datum.
         noise: Standard deviations for x1 and x2; None is estimated.
         length: Unit of length of values and noise.
-        osc: The oscillator whose motion it is thought to be.
+        osc: A guess of the oscillator; its frequencies shorten the windows.
     """
     n = len(ts)
     step = (ts[-1] - ts[0]) / (n - 1)
@@ -113,9 +114,9 @@ def quickest(osc: Oscillator) -> float:
 def local_cubics(
     ts: np.ndarray, column: np.ndarray, near: float = SMOOTHED
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Local cubic through the data near every time: its value and slope there, and the noise.
+    """Local cubic fit to the data near every time: its value and slope there, and the noise.
 
-    Near means so much time on either side, and at least seven data.
+    near: time on either side whose data are fitted; at least seven data are.
     """
     known = np.isfinite(column)
     if np.sum(known) < 7:
@@ -131,8 +132,8 @@ def local_cubics(
     off = x[rows] - np.einsum("tip,tp->ti", powers, cubics)
     from scipy.special import gammaincinv  # late, as only fits need it
 
-    # The median, because corners of the motion are not noise. That of chi^2 is less than its mean,
-    # the number of degrees of freedom.
+    # The median, because corners of the motion are not noise. The median of chi^2 is less than its
+    # mean, the number of degrees of freedom.
     freedom = 2 * half - 3
     median = 2 * gammaincinv(0.5 * freedom, 0.5)
     noise = np.sqrt(np.median(np.sum(off**2, axis=1)) / median)
@@ -155,7 +156,7 @@ def verdict_on(off: np.ndarray, chi2: float, freedom: int, estimated: bool) -> V
         off: Weighted residuals, [samples, 2], NaN where there is no datum.
         chi2: Sum of their squares.
         freedom: Degrees of freedom.
-        estimated: Whether the noise of a column at least was estimated.
+        estimated: Whether the noise of at least one column was estimated.
     """
     if not np.isfinite(chi2):
         return Verdict(np.nan, np.nan, np.nan, False)

@@ -4,7 +4,7 @@ The record is cut into windows shorter than half a loop, over which no phase is 
 starts from the record itself, by a local polynomial. The user's guess comes first. Where it does
 not lead to the record, the misfit of the smooth formulation (tanh for sgn, a fixed step) is
 minimised by Adam (optax) from several starts under `vmap`. The result is biased, by the smoothing
-and by the starts, but near; less so where a friction law changes faster than the smoothing.
+and by the windows' starts, but near; less near where a law changes faster than the smoothing.
 """
 
 from collections.abc import Iterator
@@ -28,7 +28,7 @@ SEARCH_STEPS, LEARNING_RATE = 60, 0.1
 
 
 def _smooth_misfit(unknown, selection: Selection, osc: Oscillator, record: Record, eps, steps: int):
-    """Misfit of the smooth formulation over all windows; of size 1 where it is off by `scale`."""
+    """Misfit of the smooth formulation over all windows, about |error| / (0.02 `record.scale`)."""
     u, shift = unknown
     osc = in_own_units(selection.put(osc, selection.values(u)), record.length)
     h = record.times[:, -1] / steps
@@ -61,7 +61,7 @@ def _smooth_misfit(unknown, selection: Selection, osc: Oscillator, record: Recor
     predicted = (1 - rest) * path[before, piece] + rest * path[before + 1, piece]
     scale = jnp.broadcast_to(0.02 * record.scale, predicted.shape)
     off = jnp.where(record.weights > 0, (predicted - record.values) / scale, 0.0)
-    # Grows like |off|, so windows that are hopeless from here do not outvote the others.
+    # The misfit grows like |off| only, so windows that are far off do not outvote the others.
     return jnp.mean(jnp.sqrt(1 + off**2) - 1)
 
 
@@ -97,13 +97,13 @@ def _adam(starts, selection: Selection, osc: Oscillator, record: Record, eps, st
 def first_guesses(
     selection: Selection, u, osc: Oscillator, record: Record, starts: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray, float]]:
-    """Yields the guess, then the ends of the search, best first; near ends count once.
+    """Yields the guess, then the ends of the search, best first; ends close to another count once.
 
     Each comes with the starts of its windows and its misfit (NaN for the guess).
     """
     yield np.asarray(u), np.asarray(record.starts), np.nan
     # eps is the velocity over which tanh changes its sign. A record of one velocity, of a mass that
-    # sticks throughout, has no scale of velocity; its length has to do. Steps of the scheme are
+    # sticks throughout, has no scale of velocity; that of x1 replaces it. Steps of the scheme are
     # stable up to 2.8 over the slope of the friction; two belts with one velocity double that
     # slope.
     eps = 0.1 * max(float(record.scale[1]), 0.1 * float(record.scale[0]))

@@ -16,7 +16,7 @@ from ..model.oscillator import Oscillator, has_clock, waves_of
 from ..model.parameters import leaf_groups, names_of
 from ..model.variations import Variation
 
-#: Largest number of damped Newton steps, and the longest step, in units of `Selection.values`' u.
+#: Largest number of damped Newton steps, and the longest step in the variables u of `Selection`.
 ITERATIONS, LONGEST_CHANGE = 40, 0.4
 #: Bisections by which the end of an interval of possible values is found.
 BISECTIONS = 40
@@ -29,8 +29,8 @@ class Selection(eqx.Module):
 
     Each parameter is a function of an unbounded variable u: lower + unit exp(u) or upper - unit
     exp(-u) with one bound, a logistic function of u between two bounds, and size u without bounds.
-    unit is the parameter's own, see `Variation.in_own_units`. stretch: by which u is multiplied
-    before; None: nothing is.
+    unit is the parameter's own, see `Variation.in_own_units`. stretch: factors, [p], by which u is
+    multiplied first; None: 1.
     """
 
     leaves: tuple[tuple[int, ...], ...] = eqx.field(static=True)
@@ -52,7 +52,7 @@ class Selection(eqx.Module):
         return jnp.where(has_lower | has_upper, bounded, self.size * u)
 
     def unbounded(self, values: ArrayLike) -> Array:
-        """The u that belong to given values within the bounds."""
+        """The inverse of `values`: u for values within the bounds, [p]."""
         has_lower, has_upper = jnp.isfinite(self.lower), jnp.isfinite(self.upper)
         above = jnp.log(jnp.where(has_lower, (values - self.lower) / self.unit, 1.0))
         below = -jnp.log(jnp.where(has_upper, (self.upper - values) / self.unit, 1.0))
@@ -91,8 +91,8 @@ def selection_of(
     """The parameters that `where` selects, and their u.
 
     A parameter is a leaf, or a tuple of leaves that are kept equal. until: the time up to which the
-    forcing matters. Then frequencies and phases are measured by what they do: where u changes by 1
-    no wave is shifted by more than a radian, at any time.
+    forcing matters. It scales the u of frequencies and phases: a change of u by 1 shifts no wave by
+    more than a radian up to that time.
     """
     groups, leaves = leaf_groups(osc, where), jax.tree.leaves(osc)
     named = names_of(osc)
@@ -120,7 +120,7 @@ def selection_of(
 
 
 def _shifts(osc: Oscillator, selection: Selection, u: Array, until: float) -> Array:
-    """By how much u = 1 shifts the waves of the forcing up to a time, at most, in radians, [p]."""
+    """The largest shift of a wave of the forcing up to a time, in radians per unit of u, [p]."""
 
     def angles(u):
         waves = waves_of(selection.put(osc, selection.values(u)))
@@ -131,7 +131,7 @@ def _shifts(osc: Oscillator, selection: Selection, u: Array, until: float) -> Ar
 
 
 def parameter_sizes(values: ArrayLike, units: ArrayLike) -> np.ndarray:
-    """Sizes of parameters; near zero, SMALLEST of the parameter's own unit."""
+    """Sizes of parameters, [p]: |value|, but SMALLEST times the parameter's own unit at least."""
     return np.maximum(np.abs(np.asarray(values)), SMALLEST * np.asarray(units))
 
 
@@ -173,9 +173,9 @@ def _pairs_of(bounds: Any, names: Sequence[str]) -> list[tuple[float, float] | N
 def _interval(
     osc: Oscillator, group: Sequence[int], groups: Sequence[Sequence[int]]
 ) -> tuple[float, float]:
-    """The interval in which the oscillator's checks allow leaves that are kept equal: with the
-    leaves of the other groups moved, or stretched, alike or as they are, and all other leaves as
-    they are. Exact where it ends at 0, at another leaf, or at the negative of one."""
+    """The interval of values of the leaves of a group, kept equal, that the oscillator's checks
+    allow with the leaves of the other groups unchanged, shifted alike, or scaled alike, and all
+    other leaves unchanged. Exact where it ends at 0, at another leaf, or at the negative of one."""
     leaves, structure = jax.tree.flatten(osc)
     known = np.array([float(leaf) for leaf in leaves if np.ndim(leaf) == 0])
     value = float(leaves[group[0]])

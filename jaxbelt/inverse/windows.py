@@ -21,14 +21,14 @@ from .selection import (
 )
 
 TOLERANCE = 1e-8
-#: The last stage may take LONGER times as many steps. It ends when a Gauss-Newton step promises to
+#: The last stage may take LONGER * ITERATIONS steps. It ends when a Gauss-Newton step promises to
 #: lower chi^2 by less than GAIN_ENOUGH, the square of an error in standard errors; it has not
 #: converged where the step promises more than GAIN_LEFT.
 LONGER, GAIN_ENOUGH, GAIN_LEFT = 10, 1e-5, 1e-1
-#: A parameter that is so near to its bound, in parts of its size, is at it.
+#: A parameter nearer to its bound than this fraction of its size is at the bound.
 AT_BOUND = 1e-6
-#: Factors by which the damping shrinks and grows: along a bent valley a large one is refused at
-#: every other step.
+#: Factors by which the damping shrinks and grows: with large ones every other step along a bent
+#: valley is refused.
 LESS_DAMPED, MORE_DAMPED = 3.0, 4.0
 
 
@@ -81,7 +81,7 @@ def _linearized(selection: Selection, osc: Oscillator, record: Record, u, starts
 
 
 def _squares(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Squared sensitivities of the data to the parameters, [p], and to the starts, [windows, 2]."""
+    """Sums of squared sensitivities of the data, to parameters, [p], and starts, [windows, 2]."""
     p = blocks.shape[-1] - 3
     both = np.sum(blocks[:, :p, :p], axis=0), blocks[:, p:-1, p:-1]
     return np.diag(both[0]), np.einsum("wii->wi", both[1])
@@ -92,7 +92,7 @@ def _damped_step(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Levenberg-Marquardt step of the parameters, [p], and of the starts, [windows, 2].
 
-    squares: `_squares` by which they are damped.
+    squares: as from `_squares`; damping adds a multiple of them to the diagonal.
     """
     p = blocks.shape[-1] - 3
     a, g = np.sum(blocks[:, :p, :p], axis=0), np.sum(blocks[:, :p, -1], axis=0)
@@ -108,7 +108,7 @@ def _damped_step(
 
 @dataclass
 class Linearization:
-    """`_linearized` of a record, and how often it was asked."""
+    """`_linearized` for one record, with a count of its evaluations."""
 
     selection: Selection
     oscillator: Oscillator
@@ -121,7 +121,7 @@ class Linearization:
 
 
 class FitPoint(eqx.Module):
-    """State of the iteration: unknowns, motion, blocks of the windows, chi^2."""
+    """State of the iteration: unknowns, motion, Gauss-Newton blocks of the windows, chi^2."""
 
     u: np.ndarray
     starts: np.ndarray
@@ -135,8 +135,9 @@ def fit_windows(
 ) -> FitPoint:
     """Levenberg-Marquardt iteration for one division of the record into windows.
 
-    It ends when chi^2 falls by less than the fraction `relative`; for the whole record, when
-    nothing is left to gain, or when chi^2 stays above `far`.
+    fresh: mask of the pieces at which windows begin. It ends when chi^2 falls by less than the
+    fraction `relative`; for the whole record, when nothing is left to gain, or when chi^2 is still
+    above `far` after ITERATIONS steps.
     """
     window = np.cumsum(fresh) - 1
 
@@ -179,7 +180,7 @@ def fit_windows(
 
 
 def at_bounds(selection: Selection, point: FitPoint) -> np.ndarray:
-    """Which parameters are at a bound, beyond which a whole record fits better, [p]."""
+    """Mask [p] of parameters at a bound beyond which the whole record would fit better."""
     p = point.u.size
     values = np.asarray(selection.values(jnp.asarray(point.u)))
     reached = AT_BOUND * np.asarray(parameter_sizes(values, selection.unit))
@@ -189,7 +190,7 @@ def at_bounds(selection: Selection, point: FitPoint) -> np.ndarray:
 
 
 def free_part(selection: Selection, point: FitPoint) -> np.ndarray:
-    """The block of a whole record without the parameters that are at bounds."""
+    """The Gauss-Newton block of a whole record without the parameters that are at bounds."""
     free = np.append(~at_bounds(selection, point), [True] * 3)
     return point.blocks[0][np.ix_(free, free)]
 

@@ -27,16 +27,16 @@ COLOURS = {
     "quasiperiodic": "#0072B2",
     "chaotic": "#D55E00",
 }
-#: Colours of all other categories, in order, and of cycles by the belts that they stick to, as
-#: binary digits: belt 0, belt 1, both, belt 2, ... (Okabe and Ito, and a violet).
+#: Colours of all other categories, in order. Cycles that stick have the colour numbered by their
+#: belts as binary digits: belt 0, belt 1, both, belt 2, ... (Okabe and Ito, and a violet).
 SHADES = ("#56B4E9", "#E69F00", "#CC79A7", "#009E73", "#0072B2", "#D55E00", "#7F5FA8")
 STICKS = "cycle, sticks to belt "
-#: Largest number of categories in a key, and letters in a line of it.
+#: Largest number of categories in a key, and of letters in one of its lines.
 KEY_ROOM, LINE = 8, 60
 
 
 def words_of_runs(dataset: xr.Dataset, variable: str) -> xr.DataArray:
-    """Category of each run in words; for "kind" with the belts that cycles stick to."""
+    """Category of each run in words; words of "kind" name the belts that a cycle sticks to."""
     words = decoded(dataset[[variable]])[variable].astype(object)
     if variable == "kind" and "belt" in dataset.sizes:
         sticks = dataset.sticks.transpose(*words.dims, "belt").values.astype(bool)
@@ -50,7 +50,7 @@ def words_of_runs(dataset: xr.Dataset, variable: str) -> xr.DataArray:
 
 
 def draw_categories(ax: Axes, x: np.ndarray, y: np.ndarray, words: np.ndarray) -> None:
-    """Draws words [x, y] as colours; the most frequent are in the key, the others are "other"."""
+    """Draws words [x, y] as colours, with a key; all but the most frequent become "other"."""
     counts = Counter(words.ravel().tolist())
     shown = [word for word, _ in counts.most_common(KEY_ROOM)]
     words = np.where(np.isin(words, shown), words, OTHER)
@@ -74,7 +74,7 @@ def _in_key(word: str) -> tuple[bool, bool, int, str]:
 
 
 def _colours_of_words(words: list[str]) -> list[str]:
-    """A colour for each word, no two alike; a kind always has the same one."""
+    """A colour for each word, no two alike; words of `COLOURS` and `STICKS` have fixed ones."""
     others = [word for word in words if word not in COLOURS and not word.startswith(STICKS)]
     return [
         _shade(others.index(word)) if word in others else _colour_of_kind(word) for word in words
@@ -89,7 +89,7 @@ def _colour_of_kind(word: str) -> str:
 
 
 def _shade(number: int) -> str:
-    """Colour number `number`: those of `SHADES`, then hues that do not repeat."""
+    """Colour number `number`: first the colours of `SHADES`, then hues that do not repeat."""
     if number < len(SHADES):
         return SHADES[number]
     hue = 0.618034 * number % 1.0  # multiples of the golden section spread over the circle

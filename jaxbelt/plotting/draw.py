@@ -71,7 +71,7 @@ def draw_result(result: Any, ax: Axes | None, **options: Any) -> Axes:
     Args:
         result: Any result with a `plot` method.
         ax: Axes; None makes new ones.
-        options: Options of its `plot`.
+        options: Options of the `plot` method of the result.
 
     Returns:
         The axes.
@@ -81,7 +81,7 @@ def draw_result(result: Any, ax: Axes | None, **options: Any) -> Axes:
         raise TypeError(f"result must be one that has a picture, got {type(result).__name__}")
     require_axes(ax)
     drawn = picture(result, ax, **options)
-    # A figure of several axes has its own key.
+    # A new figure with several axes already has its key.
     if ax is not None or not figure_of(drawn).legends:
         add_key(drawn)
     return drawn

@@ -25,8 +25,8 @@ from .phase import plot_phase_portrait
 from .si import plot_in_si
 from .style import belt_colour
 
-#: Ranges of sliders, at least; 0 to 1 for other numbers. Every range includes twice the first
-#: value.
+#: Smallest ranges of sliders by the end of a name; others have 0 to 1. Every range is extended to
+#: include twice the initial value.
 RANGES = {
     "friction.velocity": (0.0, 1.0),
     "velocity": (-1.0, 1.0),
@@ -62,7 +62,7 @@ class Explorer:
         self._names, self._t1 = names_of(osc), t1
         numbers = dict(zip(self._names, map(float, self._leaves), strict=True))
         for number, belt in enumerate(osc.belts):
-            # the unit of speeds is not a number of the law
+            # the unit of speeds is not a parameter of the law and gets no slider
             if isinstance(belt.friction, LawInUnits):
                 numbers.pop(f"belts[{number}].friction.unit")
         numbers |= {"x1": start[0], "x2": start[1]}
@@ -93,7 +93,7 @@ class Explorer:
             for name, leaf in zip(self._names, self._leaves, strict=True)
         ]
         shown = jax.tree.unflatten(self._structure, values)
-        if isinstance(shown, Machine):  # made anew, so that its checks run
+        if isinstance(shown, Machine):  # built again, so that its checks run
             belts = [PhysicalBelt(**vars(belt)) for belt in shown.belts]
             return Machine(shown.mass, shown.stiffness, shown.damping, belts, shown.forcing)
         check_oscillator(shown)
@@ -195,7 +195,7 @@ def _slider(ipywidgets: Any, name: str, value: float, units: Units | None) -> An
     *_, last = path = name.split(".")
     least, most = RANGES.get(".".join(path[-2:]), RANGES.get(last, (0.0, 1.0)))
     if units is not None:
-        # For a machine only the sizes of its numbers and motions are known.
+        # A machine scales RANGES by its units; other numbers range to twice their initial value.
         quantity = {"x1": "length", "lower": "length", "upper": "length", "x2": "velocity"}
         quantity |= {"velocity": "velocity"}
         unit = float(getattr(units, quantity[last])) if last in quantity else 0.0

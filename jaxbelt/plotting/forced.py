@@ -17,8 +17,8 @@ from .style import belt_colour, label_plane, new_axes
 
 #: Points of a curve, for each period of the forcing.
 SAMPLES_OF_PERIOD = 257
-#: A circle map goes on from one phase to the next if it rises by no more than so many times what
-#: the larger of its slopes there says: twice, beside a square root.
+#: A circle map counts as continuous between neighbouring phases if its rise is at most this factor
+#: times step times the larger of the slopes at both; the factor beside a square root is 2.
 STEEPEST = 2.5
 
 
@@ -69,7 +69,7 @@ def plot_circle_map(found: CircleMap, ax: Axes | None = None) -> Axes:
     x, slopes = (np.append(one, one[0]) for one in (found.phases, found.slopes))
     y, lift = (np.append(one, one[0]) for one in (found.next_phases, found.elapsed))
     x[-1] = turn
-    # How far the map rises to the next phase, once around the circle at most.
+    # Rise of the unwrapped map from each phase to the next, also from the last to 2 pi.
     rise = step + turn * np.diff(lift) / found.period
     slopes = np.abs(slopes)
     breaks = np.abs(rise) > STEEPEST * step * np.maximum(slopes[1:], slopes[:-1])

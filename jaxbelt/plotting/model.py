@@ -37,8 +37,8 @@ def plot_friction_law(
         ax: Axes; None makes new ones.
         speed: Largest speed. None: where the table of a `Tabulated` ends, 1 for any other law.
             Beyond the end of a table the curve is dashed: an extrapolation.
-        unit: Unit of the speeds that the law takes, for the label of the axis. None: that of a
-            `PhysicalBelt`, else none.
+        unit: Unit of the speeds that the law takes, for the label of the axis. None: m/s for a
+            `PhysicalBelt`, no unit for a law.
 
     Returns:
         The axes.
@@ -83,7 +83,7 @@ def plot_convergence(
 ) -> Axes:
     """Draws the largest error of approximate formulations over the width of their band.
 
-    A thin line has the slope one. errors: by label. Returns the axes.
+    widths: half-widths [n]. errors: [n] each, by label. A thin line has slope 1. Returns the axes.
     """
     ax = new_axes() if ax is None else ax
     for belt, (label, values) in enumerate(errors.items()):
@@ -150,7 +150,7 @@ def draw_mechanical_model(ax: Axes | None = None) -> Axes:
 
 
 def _draw_belt(ax: Axes, belt: int, ends, run: float, side: int, force_at: float) -> None:
-    """A belt on two rollers: its run at the height `run`, its rest above (side 1) or below (-1)."""
+    """Draws a belt on two rollers: touching side at height `run`, the rest at `side` (1: above)."""
     radius, colour = 0.6, belt_colour(belt)
     middle, far = run + side * radius, run + side * 2 * radius
     angle = np.linspace(np.pi / 2, 3 * np.pi / 2, 40)

@@ -12,7 +12,7 @@ from ..sweeps.orbit_diagram import NOT_PERIODIC, OrbitDiagram
 from .style import COORDINATES, add_key, figure_of, new_axes, parameter_label
 
 #: Marks of each kind of attractor (Okabe and Ito), and its name in the key. Undecided starts have
-#: no place; ticks at the lower edge show their parameters.
+#: no points; ticks at the lower edge mark the parameter values at which they occur.
 DOTS: dict[str, dict[str, Any]] = {
     "equilibrium": {"color": "#0072B2", "marker": ".", "label": "equilibrium"},
     "cycle": {"color": "black", "marker": ".", "label": "cycle"},
@@ -25,7 +25,7 @@ FALLING = {"equilibrium": "#56B4E9", "cycle": "#E69F00", NOT_PERIODIC: "#F5CF80"
 
 
 class _Dots(NamedTuple):
-    """A line with the points of a kind of attractor, from some starts, and its name in the key."""
+    """The line with the points of one kind of attractor from some starts; label: for the key."""
 
     kind: str
     starts: tuple[int, ...]
@@ -59,7 +59,7 @@ def plot_orbits(
 
 
 def _lines(ax: Axes, diagram: OrbitDiagram) -> list[_Dots]:
-    """Lines without points; where the parameter rises and falls one of each kind for each sense."""
+    """Lines without points: one for each kind, or for each kind and sense of a two-way sweep."""
     everywhere = tuple(range(diagram.kind.shape[1]))
     both = diagram.sampling is not None and diagram.sampling.senses == ("up", "down")
     lines = []
@@ -86,7 +86,7 @@ def _put(
     quantity: str,
     sizes: tuple[float, float] = (1.0, 1.0),
 ) -> None:
-    """Sets the points of each line, times the sizes; the key names the lines that have points."""
+    """Sets the points of each line, scaled by sizes (x, y); only lines with points have a label."""
     heights = diagram.x1 if quantity == "x1" else diagram.x2
     values = np.broadcast_to(diagram.values[:, None, None], heights.shape)
     for kind, starts, label, line in lines:
@@ -104,12 +104,12 @@ def _put(
 class _Zoom:
     """Computes an orbit diagram anew over the limits of its axes, whenever these change.
 
-    While a button of the mouse is held, as in panning, it waits.
+    Nothing is computed while a button of the mouse is held, as in panning.
     """
 
     def __init__(self, diagram: OrbitDiagram, ax: Axes, lines: list[_Dots], quantity: str):
         self.diagram, self.ax, self.lines, self.quantity = diagram, ax, lines, quantity
-        # Its position stays (1, 1) unless `plot_in_si` scales what is drawn.
+        # Empty text whose position is the scale of the axes: (1, 1) unless `plot_in_si` changes it.
         self.one = ax.text(1.0, 1.0, "")
         self.shown, self.is_held = ax.get_xlim(), False
         self.note = ax.text(0.5, 0.5, "", transform=ax.transAxes, ha="center", wrap=True)

@@ -7,8 +7,8 @@ conventions are the paper's:
   belt, in the colour of the belt; the part where the mass sticks (the sliding set) is a wide pale
   band behind it. Finite contact edges sigma are dotted vertical lines.
 - Stable cycles are thick solid lines, unstable ones dashed, other orbits thin and grey.
-- Stable fixed points are filled, unstable ones open, neutral ones grey; pseudo-foci are diamonds in
-  the same way, a segment of pseudo-equilibria is a thick bar, saddles are crosses.
+- Stable fixed points are filled, unstable ones open, neutral ones grey; pseudo-foci are diamonds
+  filled likewise, a segment of pseudo-equilibria is a thick bar, saddles are crosses.
 - Stable separatrices, which bound basins, are purple, unstable ones grey and dash-dotted.
 """
 
@@ -83,8 +83,7 @@ class ClosedOrbit(Protocol):
 
 
 def path_around(cycle: ClosedOrbit) -> np.ndarray:
-    """States of one loop, [states, 2]; events are among them where arcs are known, for sharp
-    corners."""
+    """States [states, 2] of one loop, those at events of a `Cycle` included, for sharp corners."""
     ys = np.asarray(cycle.sample(400))
     if not isinstance(cycle, Cycle):
         return ys
@@ -160,7 +159,7 @@ def plot_phase_portrait(
 
 
 def draw_orbit(ax: Axes, path: np.ndarray, words: str) -> None:
-    """Draws an orbit that begins and ends, [samples, 2], and extends the window to hold it."""
+    """Draws an orbit [samples, 2] that is not closed, and extends the window to hold it."""
     for limits, extend, x in ((ax.get_xlim(), ax.set_xlim, 0), (ax.get_ylim(), ax.set_ylim, 1)):
         margin = 0.05 * np.ptp(path[:, x])
         extend(min(limits[0], path[:, x].min() - margin), max(limits[1], path[:, x].max() + margin))
@@ -203,7 +202,7 @@ def _draw_separatrix(ax: Axes, one: Separatrix) -> None:
     path, (left, right), (bottom, top) = np.asarray(one.ys), ax.get_xlim(), ax.get_ylim()
     style = STABLE_SEPARATRIX if one.stable else UNSTABLE_SEPARATRIX
     ax.plot(*path.T, zorder=3, **style)
-    # From the point outwards, in whichever direction of time.
+    # The path from the separatrix's point outwards, whatever the direction of time.
     away = path[::-1] if one.stable else path
     outside = (away < [left, bottom]) | (away > [right, top])
     leaves = np.append(np.flatnonzero(np.any(outside, axis=1)), len(away))[0]
@@ -258,7 +257,7 @@ def _draw_edges(ax: Axes, osc: Oscillator) -> None:
 
     A name that would touch the one on its left stands a line of text higher.
     """
-    # Lower edges first: so those of class (d) have the paper's numbers in whatever order they lie.
+    # Lower edges first: class (d) then has the paper's numbers, whichever edge is the larger one.
     known = [float(e) for side in ("lower", "upper") for e in (getattr(b, side) for b in osc.belts)]
     numbers = {edge: n for n, edge in enumerate(dict.fromkeys(filter(np.isfinite, known)))}
     left, right = ax.get_xlim()
@@ -313,7 +312,7 @@ def _name_boundaries_outside(ax: Axes, names: list[tuple[float, int]]) -> None:
 
 
 def _window(osc, paths, equilibria, xlim, ylim):
-    """The given limits, or limits that hold all that is drawn with a margin."""
+    """Limits of x1 and x2: the given ones, or limits that hold all that is drawn, with a margin."""
     ends = [] if equilibria is None else [*equilibria.x1_lower, *equilibria.x1_upper]
     x1 = [float(x) for x in ends]
     x1 += [x for path in paths for x in (path[:, 0].min(), path[:, 0].max())]
@@ -375,8 +374,8 @@ def _index_at_distance(ax: Axes, path: np.ndarray, distance: float) -> int:
 def _lowest(path: np.ndarray) -> list[int]:
     """Index of the lowest point of a path, as a list.
 
-    Where the lowest stretch is level, as along a belt, its middle; empty where the path is not
-    known.
+    Where the lowest stretch is level, as along a belt, the index of its middle. Empty for a path of
+    NaN.
     """
     x2 = path[:, 1]
     (lowest,) = np.nonzero(x2 <= x2.min() + 1e-6 * np.ptp(x2))
@@ -480,7 +479,7 @@ def draw_overview(
 ) -> Figure:
     """One trajectory on a page: its time histories, and beside them its phase portrait.
 
-    With a clock the plane of x1 and x2 shows the orbit alone: what bounds it moves.
+    With a clock the phase plane shows the orbit alone, because its boundaries depend on time.
     """
     figure = journal_figure(7.2, 3.2)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.35, 1))

@@ -28,7 +28,7 @@ from .style import (
 
 #: Pixels of the coarse raster around the name of a region: half a letter's height, or its width.
 ROOM_FOR_NAME = 3
-#: Pale colours of regions whose cycles do not determine a colour.
+#: Pale colours of regions whose own colour another region has already.
 SPARE_COLOURS = ("#DDDDDD", "#F5E9A9", "#BFE3D0", "#F3D0E2", "#D9CBEA", "#C5D9E8", "#E8D5B9")
 #: Number of rows of sketches that fit on a page.
 MOST_ROWS = 4
@@ -41,11 +41,11 @@ EQUILIBRIA_NOTE = (
 def plot_region_map(regions: RegionMap, ax: Axes | None = None) -> Axes:
     """Draws the regions of a plane of two parameters, and the curves that bound them.
 
-    Every point has the colour of its own side of each curve. The colour shows what the stable cycle
+    Every point has the colour of its side of the curves. The colour shows what the stable cycle
     sticks to (the colour of the belt; both: violet; none: grey; several cycles: mixed); it is paler
     where an equilibrium is stable, too, and white where there is no cycle. In the plane of the
     paper's Fig. 6, and where there are contact edges, the regions have their names; elsewhere the
-    key says what there is. Without `ax` the figure shows the portrait of every region below the
+    key describes them. Without `ax` the figure shows the portrait of every region below the
     map, as the paper's Fig. 6 does. Returns the axes of the map.
     """
     if ax is None:
@@ -59,7 +59,7 @@ def plot_region_map(regions: RegionMap, ax: Axes | None = None) -> Axes:
     paint = map(_region_colour, unique) if regions.as_paper else _colours_of(unique)
     colours = dict(zip(unique, paint, strict=True))
     image = np.array([colours[heads[name]] for name in known])[np.searchsorted(known, raster)]
-    # Half a pixel beyond the ends, because pixels stand for points.
+    # The image extends half a pixel beyond the ends, because pixels are centred on points.
     margins = [0.5 * (v[-1] - v[0]) / (size - 1) for v, size in zip((x, y), raster.shape)]
     extent = (x[0] - margins[0], x[-1] + margins[0], y[0] - margins[1], y[-1] + margins[1])
     style: dict[str, Any] = {"origin": "lower", "aspect": "auto", "interpolation": "nearest"}
@@ -124,7 +124,7 @@ def _names_equilibria(regions: RegionMap) -> bool:
 
 
 def _region_colour(name: str) -> tuple[float, float, float]:
-    """Pale for cycles, paler where an equilibrium is stable, too; white for no cycle."""
+    """Pale colour for cycles, paler if an equilibrium is stable, too; white for no cycle."""
     letters = {"a": BELT_COLOURS[0], "b": BELT_COLOURS[1], "c": "#7F5FA8"}
     if not name or name[0] in "16":
         return (1.0, 1.0, 1.0)
@@ -135,14 +135,14 @@ def _region_colour(name: str) -> tuple[float, float, float]:
 
 
 def draw_region_map(regions: RegionMap, figure: Figure) -> Axes:
-    """Draws the map, and below it a sketch of the phase portrait of each region, in its example."""
+    """Draws the map, and below it a sketch of the phase portrait at an example of each region."""
     names = [name for name in regions.regions if _has_area(regions, name)] or [*regions.regions]
     named = regions.as_paper or _names_equilibria(regions)
     columns = 5 if named else 4
     rows = -(-len(names) // columns)
     if rows > MOST_ROWS:
         figure.set_size_inches(7.2, 5.6 + 1.15 * rows)
-    # Two grids: so the key beside the map does not take room from the sketches.
+    # Two nested grids, so that the key beside the map does not take room from the sketches.
     heights = (6, 1.25 * rows) if rows <= MOST_ROWS else (5.6, 1.15 * rows)
     whole = figure.add_gridspec(2, 1, height_ratios=heights)
     upper = whole[0].subgridspec(1, 2, width_ratios=(3.2, 1) if regions.as_paper else (2.2, 1))

@@ -54,7 +54,7 @@ def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any
     one axis shows displacement and velocity, as in the picture of a trajectory, it becomes that of
     displacement, and velocity gets its own axis at the right, in other axes of the same figure.
 
-    The parameter of a diagram or of fractions is in SI units, too; the argument of a function stays
+    The parameter of a diagram or of fractions is in SI units, too; an argument of a function stays
     as the function takes it, and you label it: `ax.set_xlabel("belt velocity $V$ (m/s)")`. A
     `quantity` is in SI units where it is a functional of this package, such as `energy_fed`, also
     in `functools.partial`; the values of your own function stay as they are, and the label says
@@ -118,9 +118,9 @@ def plot_in_si(result: Any, machine: Any, ax: Axes | None = None, **options: Any
 
 
 def _units_of_picture(result: Any, machine: Any) -> tuple[Units, tuple[float, str] | None]:
-    """Units of a picture; for its parameter the value of 1 in SI units, and its label.
+    """Units of a picture; and for its parameter (size of the unit in SI, label of the axis).
 
-    The latter are None where the parameter is in SI units already.
+    The latter is None without a parameter, and where the unit of the parameter is 1 or unknown.
     """
     if not isinstance(result, AlongParameter):
         check_machine(result, machine)
@@ -152,22 +152,22 @@ def _relabel_key(ax: Axes, units: Units) -> None:
 
 
 class _Picture:
-    """Converts axes to SI units, but for what is kept: what one of them held in SI units before."""
+    """Converts axes to SI units, except artists in SI units that one of them held before."""
 
     def __init__(self, units: Units):
         self.units, self.ax = units, None
         self.kept: set[Artist] = set()
 
     def keep(self, ax: Axes) -> None:
-        """Keeps what axes hold, before a result is drawn into them."""
+        """Records artists and limits of axes before a drawing; these artists stay unscaled."""
         self.ax, self.kept = ax, {*_artists(ax)}
         self.limits = ax.get_xlim(), ax.get_ylim()
         self.held = ax.dataLim.get_points().copy()
         ax.dataLim.set_points(Bbox.null().get_points())
 
     def join(self) -> None:
-        """Extends limits that are not set to hold everything; the new part is in SI units now,
-        too."""
+        """Extends automatic limits to hold what was there before and what is new, both in SI
+        units."""
         if self.ax is None:
             return
         lower, upper = zip(self.held, self.ax.dataLim.get_points(), strict=True)
@@ -195,7 +195,7 @@ class _Picture:
         if isinstance(functional, functools.partial):
             coordinate = functional.keywords.get("coordinate", coordinate)
             functional = functional.func
-        # A user's functional may have no hash.
+        # Compared by identity, because a user's functional may have no hash.
         known = [quantity for one, quantity in MEASURED_IN.items() if one is functional]
         if not known:
             ax.set_ylabel(f"{name} (dimensionless)")
@@ -264,8 +264,8 @@ def _artists(ax: Axes) -> list[Artist]:
 
 
 def _scale_artist(artist: Artist, ax: Axes, sizes: np.ndarray) -> None:
-    """Scales those coordinates of an artist that are data."""
-    # Matplotlib before 3.11 misspells it.
+    """Scales the coordinates of an artist that are in units of the data, by sizes (x, y)."""
+    # Matplotlib before 3.11 misspells the name of this method.
     names = ("contains_branch_separately", "contains_branch_seperately")
     in_data = next(name for name in names if hasattr(Transform, name))
 
@@ -278,7 +278,7 @@ def _scale_artist(artist: Artist, ax: Axes, sizes: np.ndarray) -> None:
         x, y = place * of_data(transform)
         return float(x), float(y)
 
-    # For a patch get_transform() would include its own shape.
+    # The method of the base class: that of a patch would include the patch's own shape.
     transform = Artist.get_transform(artist)
     for edges, size in zip(artist.sticky_edges, of_data(transform), strict=True):
         edges[:] = [edge * size for edge in edges]

@@ -107,9 +107,9 @@ def journal_figure(width: float, height: float) -> Figure:
 
 
 def key_entries(axes: Sequence[Axes]) -> dict[str, Any]:
-    """Labels in axes, each once, with their artists, one for each colour.
+    """Labels in axes, each once, with a tuple of artists: one for each colour of the label.
 
-    Those of a phase portrait come last, in the order of `KEY_ORDER`.
+    Labels of a phase portrait come last, in the order of `KEY_ORDER`.
     """
     drawn: dict[str, dict[Any, Any]] = {}
     for one in axes:
@@ -178,8 +178,8 @@ def add_key(ax: Axes) -> None:
 def key_columns(width: float, labels: Sequence[str], room: float = 0.0) -> int:
     """Number of columns of a key that fit into a width, in points.
 
-    Rather than one column it takes two that need more, if they fit into `room` beside the axes,
-    too.
+    Where only one column fits into the width, two are taken if they fit into `room`, which includes
+    the space beside the axes.
     """
     size = matplotlib.rcParams["font.size"]
     letters = 0.48 * size * np.array([len(label.replace("$", "")) for label in labels])
@@ -224,7 +224,7 @@ def in_fractions(unit: str) -> str:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Writes a figure as PNG (or what else the ending of the path says)."""
+    """Writes a figure in the format that the suffix of the path names; PNG without one."""
     figure.savefig(path, dpi=220)
 
 

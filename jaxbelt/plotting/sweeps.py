@@ -33,24 +33,24 @@ from .style import (
     require_axes,
 )
 
-#: Axes of datasets that are not parameters.
+#: Axes of datasets that number belts or attractors, and are not parameters.
 COUNTED = ("belt", "attractor")
 #: Axes of datasets along which starts differ.
 AXES_OF_STARTS = ("x1", "x2")
-#: Variables that are 0 for an attractor other than a cycle or a periodic motion, though it has no
-#: loop.
+#: Variables that measure one loop of a cycle or a periodic motion; datasets hold 0 for all other
+#: attractors.
 OF_LOOPS = ("stick_duration", "d_stick_duration")
 
 
 def plot_sweep(
     dataset: xr.Dataset, variable: str, ax: Axes | None = None, *, share: str | None = None
 ) -> Axes:
-    """Draws a variable of a sweep over its two axes longer than one, or along its one.
+    """Draws a variable of a sweep over its axes longer than one, which are one or two.
 
     "kind" shows equilibria, and cycles by the belts that they stick to, each kind in the same
     colour in every picture. Other categories, such as "signature", have a key of the most frequent
     ones; the rest is "other" (along one axis: numbers of the categories where their words are
-    long). Along one axis a variable of each belt, or of each attractor, is as many lines. Runs of
+    long). Along one axis a variable of belts or attractors has a line for each of them. Runs of
     an unfinished store that are not done are left white, and so are runs without a cycle in stick
     durations. The title of a sweep of attractors with one start at each point says so: other starts
     may lead elsewhere.
@@ -77,7 +77,7 @@ def plot_sweep(
         dataset, variable = _shares_of(dataset, variable, share), "share"
     attributes = dataset[variable].attrs
     is_category = variable == "kind" or "flag_meanings" in attributes
-    # Signatures are numbered when all are known.
+    # Signatures get numbers only once all runs are done.
     fits = is_category or variable != "signature"
     require(fits, "dataset", "of a sweep that is done for its signatures", "one that is not")
     values = (words_of_runs if is_category else _numbers_of_runs)(dataset, variable)
@@ -86,7 +86,7 @@ def plot_sweep(
     last = values.dims[-1]
     are_lines = values.ndim == 1 or (last in COUNTED and variable != "kind")
     if are_lines and is_category and max(map(len, values.values.flat)) > LINE // 2:
-        # Words do not fit beside an axis; numbers stand for them.
+        # Long words do not fit beside an axis; the numbers of the categories replace them.
         values = _numbers_of_runs(dataset, variable).squeeze(drop=True)
     ax = new_axes() if ax is None else ax
     names = [_axis_label(dataset[name]) for name in map(str, values.dims)]
@@ -122,7 +122,7 @@ def plot_sweep(
 
 
 def _shares_of(dataset: xr.Dataset, variable: str, word: str) -> xr.Dataset:
-    """Share of the starts for which a category has this word, as the variable `share`."""
+    """Dataset with the variable `share`: fraction of the starts whose category is `word`."""
     starts = [name for name in AXES_OF_STARTS if name in dataset[variable].dims]
     expected = "None, or asked of a sweep with axes x1 or x2 for several starts"
     require(starts, "share", expected, f"{word!r} of one without")
@@ -131,7 +131,7 @@ def _shares_of(dataset: xr.Dataset, variable: str, word: str) -> xr.Dataset:
     is_it = (decoded(dataset[[variable]])[variable] == word).astype(float)
     share = is_it.where(dataset.status >= 0).mean(starts)
     share.attrs["long_name"] = f"share of starts: {word.replace('_', ' ')}"
-    # The label names the variable.
+    # Without attributes such as the title's start: the label says what the share is.
     return xr.Dataset({"share": share})
 
 
@@ -168,7 +168,7 @@ def _with_unit(words: str, attributes: dict[str, Any]) -> str:
 def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:
     """Draws which start leads where, with the cycles; the unstable cycle between basins is dashed.
 
-    Of a forced oscillator it draws the states of its periodic motions at the phase 0.
+    For a forced oscillator it draws the states of the periodic motions at the phase 0.
 
     Basins of cycles are pale blue and green, those of equilibria pale orange, undecided starts
     white. Below the axes is a key, as in `Basins.plot`.
@@ -204,7 +204,7 @@ def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:
             x1, x2 = np.asarray(motion.starts).T
             seen = (x1 >= x1s[0]) & (x1 <= x1s[-1]) & (x2 >= x2s[0]) & (x2 <= x2s[-1])
             if np.any(seen):
-                # Those that are found attract: filled.
+                # Filled marks, because all motions in `cycles` are attractors.
                 ax.plot(x1, x2, marker=mark, color="black", ls="none", label=name)
         label_plane(ax)
         ax.set(**limits)
@@ -216,7 +216,7 @@ def plot_basins(basins: Basins, ax: Axes | None = None) -> Axes:
 
 
 def _basin_colours(attractors: Sequence[str]) -> list[str]:
-    """Pale, so that lines stay visible; different in lightness for print without colour."""
+    """Pale colours, so that lines stay visible; of different lightness for print without colour."""
     cycles, others = (
         iter(["#B5D6EC", "#A9DCC8", "#D5E8F5", "#8FB8D8", "#7FC4A8"]),
         iter(["#F6C98F", "#F3DCE8", "#F5E9A9", "#E3A56B", "#DDB5CB"]),
@@ -278,14 +278,14 @@ def _layer(name: str) -> int:
 def _with_steps(values: np.ndarray, shares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Shares [values, bands] over the parameter, with steps.
 
-    Where the set of bands changes between two values the shares are constant up to the middle,
-    which occurs twice.
+    Where the set of bands changes between two values, shares step at the middle of both values,
+    which occurs twice in the result.
     """
     changes = np.flatnonzero(np.any((shares[1:] > 0) != (shares[:-1] > 0), axis=1))
     middles = 0.5 * (values[changes] + values[changes + 1])
     x = np.concatenate([values, middles, middles])
     rows = np.concatenate([np.arange(len(values)), changes, changes + 1])
-    # Of three points at one place the left-hand one comes first.
+    # Points with equal x are in the order of their rows.
     order = np.lexsort((rows, x))
     return x[order], shares[rows[order]]
 

@@ -21,7 +21,7 @@ from pathlib import Path
 from .cases import REGIMES, STRUCTURES
 from .outcome import Outcome, part, summed
 
-#: Of which module each campaign is.
+#: Module of each campaign.
 CAMPAIGNS = {
     **dict.fromkeys(("final", "simulate", "derivatives", "attractors", "grazing"), "runs"),
     **{
@@ -34,7 +34,7 @@ CAMPAIGNS = {
     "forced-sweep": "forced_sweeps",
     "forced": "forced_runs",
 }
-#: What can be asked of each campaign beside `--results`.
+#: Options that each campaign knows, besides `--results`.
 PLAIN = frozenset({"seed", "runs"})
 RUNS = PLAIN | {"threads", "extreme_share", "heavy", "regime", "structure", "tol", "table"}
 KNOWN = {
@@ -51,7 +51,7 @@ KNOWN = {
     "derivatives": RUNS | {"by"},
     "grazing": RUNS - {"extreme_share", "heavy", "regime"} | {"by"},
 }
-#: What is not told.
+#: Default values of options.
 DEFAULTS = dict(
     seed=0,
     runs=2000,
@@ -61,9 +61,9 @@ DEFAULTS = dict(
     by="simulate",
     threads=os.cpu_count(),
 )
-#: Seconds between two lines where everything agrees.
+#: Seconds between two lines of progress while all cases agree.
 QUIET = 15.0
-#: Lines printed of one case; the file has all of them.
+#: Most lines printed for one case; the file of results has all of them.
 SHOWN = 6
 
 
@@ -94,7 +94,7 @@ def main(arguments=None):
 
 
 def _go_through(campaign, options, numbers, results, was_asked):
-    """Compare the cases that have no result yet."""
+    """Compares the cases that have no result yet."""
     began = told = time.monotonic()
     wrong = 0
     for number in numbers:
@@ -122,8 +122,8 @@ def _go_through(campaign, options, numbers, results, was_asked):
 
 @contextlib.contextmanager
 def _stopping():
-    """Let Ctrl-C and a signal to terminate end what is done inside, and go on behind it; gives a
-    function that says whether there was one.
+    """Context that Ctrl-C or a signal to terminate ends, after which the program goes on; yields a
+    function that says whether there was such a signal.
 
     Inside of the engine's compiled code the interrupt becomes another exception.
     """
@@ -145,7 +145,7 @@ def _stopping():
 
 
 class Results:
-    """Outcomes by the number of their case, and in a file, if there is to be one."""
+    """Outcomes by the number of their case; path: a file that keeps them, or None."""
 
     def __init__(self, path, header):
         self.path, self.commit = path, _commit()
@@ -159,7 +159,7 @@ class Results:
             number, commit = row.pop("number"), row.pop("commit")
             self.outcomes[number] = Outcome(**row)
             self.commits.add(commit)
-        # Begun anew, for the last line may have been cut.
+        # The file is written again, because its last line may have been cut.
         lines = path.read_text(encoding="utf-8").splitlines()[: len(rows)] if rows else []
         lines = lines or [json.dumps(header)]
         path.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
@@ -173,7 +173,7 @@ class Results:
 
 
 def _rows(path):
-    """The lines of a file of results; without its last one where that was cut."""
+    """Parsed lines of a file of results, without the last one if it was cut."""
     rows = []
     lines = path.read_text(encoding="utf-8").splitlines()
     for line in lines:
@@ -186,14 +186,14 @@ def _rows(path):
 
 
 def _commit():
-    """The commit that is checked out, with a mark where files differ from it."""
+    """The commit that is checked out, marked "-dirty" if files differ from it."""
     asked = ["git", "describe", "--always", "--dirty", "--exclude", "*"]
     told = subprocess.run(asked, cwd=Path(__file__).parent, capture_output=True, text=True)
     return told.stdout.strip() or "unknown"
 
 
 def _parsed(arguments):
-    """What is asked; what a campaign does not know is refused."""
+    """Options of the command line, defaults included; refuses those that the campaign has not."""
     parser = _parser()
     options = parser.parse_args(arguments)
     what = options.what
@@ -211,7 +211,7 @@ def _parsed(arguments):
 
 
 def _whole(least, below=None):
-    """A type of arguments: whole numbers from the least one on."""
+    """Type of an argument: whole numbers from `least` on, and below `below` unless that is None."""
 
     def whole(text):
         value = int(text)
@@ -281,7 +281,7 @@ def _parser():
 
 
 def put_rows(path, rows):
-    """Put rows before the mark in the page, in place of those of the same campaign."""
+    """Puts rows before the mark in the page, in place of rows of the same campaign."""
 
     def key(row):
         cells = row.split(" | ")

@@ -1,14 +1,14 @@
 """Branches of periodic forced motions: `bifurcation_diagram` against the engine, row by row.
 
-Through a random or round oscillator with one force a branch is followed from what `find_cycle`
-finds, by the force's frequency or amplitude, or by a belt's velocity. The engine starts at the
-state of each row and has to come back after the row's periods; its events are those of the row's
-motion; differences of its runs say whether the row is stable. Then
+A branch of a random or round oscillator with one force is followed from the motion of `find_cycle`,
+along the force's frequency or amplitude, or a belt's velocity. The engine starts at the state of
+each row and has to return to it after the row's periods; its events are those of the row's motion;
+differences of its runs decide whether the row is stable. Then
 
-- two rows that follow one another have the same events and the same stability, or there is a point
+- two successive rows have the same events and the same stability, or there is a bifurcation point
   between them, or the branch turns back;
 - at each point the events or the stability change, or the branch turns back or ends;
-- from a stable row a run comes to the next one, if that is stable, too, and the branch goes on.
+- a run from a stable row reaches the next row, if that is stable, too, and the branch goes on.
 """
 
 import functools
@@ -23,8 +23,8 @@ import jaxbelt as jb
 from . import forced_cases, forced_package
 from .outcome import Outcome
 
-#: Structures without edges and with them, with one belt and two; of the last ones the second belt
-#: is the image of the first, so that there are symmetric motions.
+#: Structures without edges and with them, with one belt and two; in the last two the second belt is
+#: the mirror image of the first, so that there are symmetric motions.
 STRUCTURES = tuple(
     forced_cases.Structure(laws, edges, 1, (False,) * len(laws), (False,) * len(laws))
     for laws, edges in (
@@ -40,15 +40,15 @@ STRUCTURES = tuple(
     )
 )
 SYMMETRIC = len(STRUCTURES) - 2
-#: Rows are the engine's up to this; of unstable ones times their growth.
+#: Largest error of the engine's return to a row, times the largest multiplier where that is > 1.
 SAME = 1e-8
-#: Nearer to one than this no modulus of a multiplier says whether a row is stable.
+#: Distance from 1 within which the largest modulus of the multipliers does not decide stability.
 NEUTRAL = 1e-4
-#: Rows that are asked for.
+#: Number of rows of a diagram.
 ROWS = 48
-#: Periods of the motion after which a run has come to it, and how near.
+#: Number of periods of a motion within which a run must reach it, and the largest distance then.
 SETTLES, SETTLED = 400, 1e-5
-#: Multipliers are differences: of runs that pass the same events.
+#: Accuracy of the engine's multipliers, which are differences of runs with the same events.
 GOOD = 1e-3
 
 PARAMETERS = ("frequency", "amplitude", "velocity")
@@ -121,7 +121,7 @@ def outcome(options, number: int) -> Outcome:
 
 
 def _looked_at(osc, parameter, value, motion):
-    """What the engine says of a row."""
+    """The engine's results for a row."""
     here, n = _at(osc, parameter, float(value)), int(motion.periods)
     start = np.asarray(motion.start)
     run = forced_cases.stroboscopic(here, start, n)
@@ -175,7 +175,7 @@ def _changes(pair):
 
 
 def _compare(one, pairs, points, where):
-    """Assign points to pairs of rows, and look for changes without a point and the reverse."""
+    """Assigns points to pairs of rows; records changes without a point and the reverse."""
     with_point = Counter()
     for point in points:
         if int(point.status) != jb.Status.OK:
@@ -199,7 +199,7 @@ def _compare(one, pairs, points, where):
 
 
 def _distance(value, start, pair):
-    """How far a point of the branch is from the straight way between two rows."""
+    """Distance of a point of the branch from the straight segment between two rows."""
     a, b = (np.array([row["value"], *row["start"]]) for row in pair[:2])
     at = np.array([value, *start])
     way = b - a
@@ -208,8 +208,8 @@ def _distance(value, start, pair):
 
 
 def _is_beside(value, start, pair):
-    """Whether a point lies between two rows by its value, and is no farther from them than they are
-    from one another, about."""
+    """Whether the value of a point lies between those of two rows, and its start is about as close
+    to theirs as they are to each other."""
     before, after = pair[:2]
     inside = min(before["value"], after["value"]) <= value <= max(before["value"], after["value"])
     apart = np.max(np.abs(before["start"] - after["start"])) + 0.01

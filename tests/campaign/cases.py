@@ -14,7 +14,7 @@ from . import engine
 from .engine import Belt, Oscillator
 from .units import ENGINES, Units
 
-#: Structures of laws and edges of a campaign, each of which is compiled.
+#: Number of structures (laws and edges) of a campaign; each needs a compilation.
 STRUCTURES = 9
 
 LAWS = ("conti", "coulomb", "stribeck")
@@ -23,20 +23,20 @@ PAPER = ("conti", 1.0, 0.6, 10.0, 0.0)
 
 @dataclass(frozen=True)
 class Case:
-    """An oscillator, a start and how long it runs; kind says where it came from, and units in which
-    ones the package is asked."""
+    """An oscillator, a start and a duration; kind: origin of the case; units: those in which the
+    package gets it."""
 
     oscillator: Oscillator
     y0: tuple
     T: float = 50.0
     kind: str = "random"
-    #: How far a grazing orbit stays from what it grazes; negative: it goes so far beyond.
+    #: Distance of a grazing orbit from its boundary or edge; negative: it goes beyond by as much.
     distance: float | None = None
     units: Units = ENGINES
 
     @property
     def given(self):
-        """The oscillator and the start as the package is given them."""
+        """The oscillator and the start in the units in which the package gets them."""
         x1, x2 = self.y0
         return self.units.given(self.oscillator), (x1 * self.units.length, x2 * self.units.length)
 
@@ -130,7 +130,7 @@ def _random_law(rng, name):
 
 
 def _intervals(rng, n, number):
-    """Contact intervals of the classes (b), (c), (d), or any."""
+    """Contact intervals of n belts: those of class (c), of class (d), or random ones."""
     style = rng.integers(4) if n > 1 else 3
     if style == 0:
         s = number(-1.2, 1.2)
@@ -215,7 +215,7 @@ def _rational_law(rng, name):
 
 
 def rational_case(rng, structure, T=50.0):
-    """Every parameter a multiple of 1/20, and what is equal or related more often than not."""
+    """A case whose parameters are multiples of 1/20, and often equal or related."""
 
     def number(a, b):
         return round(float(rng.integers(round(20 * a), round(20 * b) + 1)) / 20, 2)
@@ -340,11 +340,11 @@ def heavy_case(rng, structure, T=50.0):
 
 # ---------------------------------------------------------------- regimes
 
-#: What is asked of a regime: its structures.
+#: Structures of each regime.
 REGIMES = {
     # Four and six belts.
     "many": [(("conti",) * 4, True), (("conti", "coulomb") * 2, False), (("conti",) * 6, True)],
-    # The static limit is far from what the belt rubs with.
+    # The static limit is far from the kinetic friction.
     "jumps": [(("coulomb", "coulomb"), True), (("table",), False), (("table", "conti"), True)],
     # Stribeck's speed is 1e-4 of that of the belt.
     "thin": [(("stribeck",), False), (("stribeck", "conti"), True), (("stribeck",) * 2, False)],
@@ -395,7 +395,7 @@ def grazing_case(rng, structure, smallest, largest=1e-3):
             edge, side = float(rng.choice(edges)), int(rng.choice([-1, 1]))
             x1, x2 = edge + side * distance, 0.0
             mode = _mode_beside(osc, edge, side, x2, {})
-            # Outside, on that side, x1 turns back from the edge.
+            # On that side of the edge the acceleration has to turn x1 back from it.
             if side * engine.force(osc, mode, x1, x2) <= 0:
                 continue
         else:
@@ -425,7 +425,7 @@ def grazing_case(rng, structure, smallest, largest=1e-3):
         )
         run = engine.simulate(osc, y0, case.T)
         first = run.t[0] if len(run.t) else inf
-        # The grazing is the first thing that happens, and nothing else is as near.
+        # Grazing must be the first event, and no other event may be as close.
         if distance > 0:
             good = (
                 first > before + 1e-4 and abs(run.margin / distance - 1) < 0.05 + 1e-15 / distance
@@ -437,10 +437,10 @@ def grazing_case(rng, structure, smallest, largest=1e-3):
 
 
 def grazing_cycle(rng, smallest, largest=1e-3):
-    """An oscillator with one belt more, whose edge a cycle misses, or goes beyond, by a distance.
+    """An oscillator with an extra belt, whose edge a cycle misses, or goes beyond, by a distance.
 
-    Or whose boundary, if it has no load: then nothing changes but the events. The start is on the
-    cycle of the other belts, half a loop before.
+    Or the cycle misses the boundary of an extra belt without load, which changes only the events.
+    The start is on the cycle of the other belts, half a loop before.
     """
     while True:
         structure = (("conti",) * int(rng.integers(1, 3)), False)

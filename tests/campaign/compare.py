@@ -1,15 +1,15 @@
-"""What the package says of a case against what the engine says.
+"""The package's answer for a case against the engine's.
 
 An answer is right if it is the engine's: sequence of events, final mode, status, and the states
-within the tolerance. How far the errors of a tolerance go is asked of the engine itself, by runs
-that are disturbed at every step and every event by as much. Verdicts:
+within the tolerance. The effect of a tolerance is measured with the engine itself, by runs that are
+disturbed by as much at every step and every event. Verdicts:
 
-- "same": it is the engine's answer;
-- "tolerance": not quite, but it is the answer of a run that is disturbed by the tolerance that was
-  asked for, so that the sequence of events is beyond it;
+- "same": the answer is the engine's;
+- "tolerance": the answer is not the engine's, but that of a run disturbed by the tolerance asked
+  for: the tolerance does not determine the sequence of events;
 - "corner": the run comes within 1e-9 of another outcome, where rounding decides, and the answer is
-  that of a neighbour, parameters or start moved by 1e-7;
-- otherwise what is different, in a word or two.
+  that of a neighbour, whose parameters or start are moved by 1e-7;
+- otherwise the difference, in a word or two.
 """
 
 import itertools
@@ -19,22 +19,22 @@ import numpy as np
 
 from . import derivatives, engine
 
-#: A run that comes this near to another outcome is at a corner, and its neighbours are this far.
+#: Distance from another outcome below which a run is at a corner, and distance of its neighbours.
 CORNER, NEIGHBOUR = 1e-9, 1e-7
-#: Local errors of a step that may add up without being seen in disturbed runs.
+#: Number of local errors that may add up beyond the effect that disturbed runs show.
 STEPS = 30
-#: Disturbed runs that are asked.
+#: Number of disturbed runs.
 DISTURBED = 6
 #: Statuses of runs that came to an end.
 ORDINARY = (engine.OK, engine.STUCK_FOREVER, engine.PSEUDO_FOCUS)
 #: The package's statuses of runs that take too many segments or steps, and the engine's.
 GAVE_UP = (3, 4)
 ENGINE_GAVE_UP = (engine.BUDGET, engine.CORNER, engine.STEPS)
-#: Events and steps of a second try of the engine; and events of one, where the package can be asked
-#: for less of the run.
+#: Limits of events and steps in the engine's second try; ENOUGH: limit of events where the package
+#: can be asked for a shorter run.
 MANY_EVENTS, MANY_STEPS, ENOUGH = 2_000_000, 20_000_000, 50_000
 GOOD = ("same", "tolerance", "corner")
-#: Differences that a run has to its own tolerance where it passes some ten thousand events.
+#: Differences that the tolerance explains in a run with some ten thousand events.
 UNSURE = ("state", "sequence", "more events", "fewer events")
 
 
@@ -47,7 +47,7 @@ def neighbours(case, by=NEIGHBOUR, joint=24, seed=0):
     osc, n = case.oscillator, len(case.oscillator.belts)
 
     def moved(shifts):
-        """shifts: of x1, x2, damping, omega, and five a belt."""
+        """shifts: of x1, x2, damping, omega; of each belt velocity, load, static, lower, upper."""
         belts = []
         for i, b in enumerate(osc.belts):
             velocity, load, static, lower, upper = shifts[4 + 5 * i : 9 + 5 * i]
@@ -67,7 +67,7 @@ def neighbours(case, by=NEIGHBOUR, joint=24, seed=0):
         )
         return replace(case, oscillator=new, y0=(case.y0[0] + shifts[0], case.y0[1] + shifts[1]))
 
-    # Belts that share a number go on sharing it, and so do edges.
+    # Equal velocities of belts stay equal, and so do equal edges.
     def tied(shifts):
         groups = {}
         for i, b in enumerate(osc.belts):
@@ -86,13 +86,13 @@ def neighbours(case, by=NEIGHBOUR, joint=24, seed=0):
         shifts = by * rng.uniform(-1, 1, size)
         yield moved(tied(shifts) if k % 2 else shifts)
     for _ in range(joint):
-        # A run may come to several corners, and lie as it is in some of them.
+        # A run may pass several corners, and agree without a shift at some of them.
         yield moved(by * rng.uniform(-1, 1, size) * (rng.uniform(size=size) < 0.3))
 
 
 def spread(case, noise, reference, states):
-    """How far disturbances of a size move states; states(run) gives them, or None for another
-    sequence. Returns the largest distance and the disturbed runs."""
+    """Largest distance of the states of disturbed runs from `reference`, and these runs. noise:
+    size of the disturbances. states(run): its states, or None if its sequence differs."""
     runs = [run(case, noise=noise, seed=i) for i in range(DISTURBED)]
     found = [states(r) for r in runs]
     far = [np.max(np.abs(f - reference)) for f in found if f is not None and np.size(f)]
@@ -106,7 +106,7 @@ def difference(case, told, mine, tol):
     """What differs between the package's answer `told` and a run of the engine, or None."""
     focus = engine.PSEUDO_FOCUS
     if told.status != mine.status and focus in (told.status, mine.status):
-        # Both may be right: one tells sooner than the other that a run converges.
+        # Both may be right: one recognises sooner than the other that the run converges.
         return _focus_difference(case, told, mine)
     if told.status in GAVE_UP and mine.status in ENGINE_GAVE_UP:
         return None  # too much for both, and both say so
@@ -132,9 +132,9 @@ def difference(case, told, mine, tol):
 
 
 def _focus_difference(case, told, mine):
-    """One ended in a pseudo-focus and the other did not, or not yet."""
+    """The difference, or None, where one ended in a pseudo-focus and the other not, or not yet."""
     if {told.status, mine.status} == {engine.PSEUDO_FOCUS, engine.STUCK_FOREVER}:
-        # At rest where loops are lost in rounding, on an edge of a belt at rest.
+        # Loops around an edge of a belt at rest shrink below rounding; then the mass is at rest.
         same = abs(told.x1 - mine.y_end[0]) < 1e-6 and abs(told.x2 - mine.y_end[1]) < 1e-6
         return None if same else f"status {told.status}, not {mine.status}"
     longer = replace(case, T=10 * case.T)
@@ -158,7 +158,7 @@ def _focus_difference(case, told, mine):
 
 
 def _state_difference(case, told, mine, tol):
-    # The relative tolerance allows a state that is large an error as large.
+    # By the relative tolerance the error may grow with the size of the state.
     size = np.maximum(1.0, np.abs(mine.y_end))
     far = np.max(np.abs(np.array([told.x1, told.x2]) - mine.y_end) / size)
     # Not `>`: NaN is far.
@@ -173,7 +173,7 @@ def _state_difference(case, told, mine, tol):
     rows = np.array([(e[0], e[3], e[4]) for e in told.events])
     table = np.column_stack([mine.t, mine.y])
     away = np.abs(rows - table)
-    # An error in the state is one in time over the speed towards the line.
+    # An error in time is an error in the state divided by the speed towards the line.
     away[:, 0] *= np.minimum(_speeds(case, mine), 1.0)
     if not states and np.all(away <= STEPS * tol):
         return None
@@ -188,7 +188,7 @@ def _state_difference(case, told, mine, tol):
 
 
 def _speeds(case, mine):
-    """How fast each event's line is approached."""
+    """Speed [events] towards the boundary or edge of each event."""
     modes = [run(replace(case, T=1e-12)).mode_end, *mine.codes.tolist()]
     return np.array(
         [
@@ -207,9 +207,9 @@ def _same_kind(r, mine, value):
 def judge(case, told, tol, again=None):
     """The verdict on a final state or a trajectory, and the engine's run.
 
-    again(case, tol): asks for another run; that is as long as the engine can follow it.
+    again(case, tol): the package's answer for a shorter run, where the engine cannot follow it all.
     """
-    # Its own error is amplified near grazing as much as the other's, and has to be the smaller one.
+    # Near grazing the engine's error grows as much as the package's, so it has to be smaller.
     mine = run(case, tol=min(1e-13, 0.01 * tol))
     if mine.status in (engine.BUDGET, engine.STEPS) and told.status in ORDINARY:
         events = ENOUGH if again else MANY_EVENTS
@@ -222,7 +222,7 @@ def judge(case, told, tol, again=None):
         return "same", mine
     if _rest_alike(case, told, mine):
         return "tolerance", mine
-    grazing = case.distance is not None  # that is what it is made for: no excuse
+    grazing = case.distance is not None  # closeness is intended there, and no excuse
     others = []
     for seed in range(DISTURBED):
         for noise in (tol,) if grazing else (tol, 10 * tol):
@@ -252,10 +252,10 @@ def judge(case, told, tol, again=None):
 
 
 def _among(told, others, mine):
-    """Whether a state and its number of events are among those of the disturbed runs, none of which
-    has the sequence of the run.
+    """Whether the answer's state and number of events lie within those of the disturbed runs, none
+    of which has the engine's sequence.
 
-    A run of some ten thousand events has its sequence to no tolerance, nor their number.
+    With some ten thousand events no tolerance determines their sequence or their number.
     """
     if any(run.sequence == mine.sequence for run in others):
         return False
@@ -267,8 +267,8 @@ def _among(told, others, mine):
 
 
 def _between(case, told, mine, tol):
-    """Whether disturbances below the tolerance give the events of an answer, but not those of the
-    run, and states on all sides of its own: where errors grow a millionfold."""
+    """Whether runs disturbed by less than the tolerance have the answer's events, not the engine's,
+    and states on all sides of the answer's: where errors grow a millionfold."""
     runs = [run(case, noise=0.1 * tol, seed=seed) for seed in range(4 * DISTURBED)]
     other = [r for r in runs if r.sequence != mine.sequence or r.status != mine.status]
     alike = [r for r in other if difference(case, told, r, tol) in (None, "state", "event")]
@@ -283,7 +283,7 @@ def _rows(mine):
 
 
 def _in_turn(events):
-    """Kinds and belts of events; of those that happen at one instant in the order of belts."""
+    """Kinds and belts of events, grouped by instant, and sorted within each group."""
     found, instant = [], -np.inf
     for t, kind, belt, *_ in events:
         if t - instant > CORNER:
@@ -294,8 +294,8 @@ def _in_turn(events):
 
 
 def _rest_alike(case, told, mine):
-    """Whether both come to rest at one place after the same events, but for those nearer to it than
-    any tolerance: which belt at rest or edge is passed last there, rounding decides."""
+    """Whether both come to rest at one place after the same events, except events closer to it than
+    any tolerance: there rounding decides which belt at rest or edge is passed last."""
     x1, x2 = mine.y_end
     pull = 0.0 if 0 in mine.mode_end else engine.force(case.oscillator, mine.mode_end, x1, x2)
     rests = max(abs(x2), abs(pull), abs(told.x2), abs(told.x1 - x1)) <= CORNER
@@ -309,7 +309,7 @@ def _rest_alike(case, told, mine):
 
 
 def _rests_unstably(case):
-    """Whether it starts on an unstable equilibrium: when it leaves, rounding decides."""
+    """Whether a case starts on an unstable equilibrium, so that rounding decides when it leaves."""
     osc, (x1, x2) = case.oscillator, case.y0
     mode = run(replace(case, T=1e-9)).mode_end
     if x2 != 0 or 0 in mode or abs(engine.force(osc, mode, x1, 0.0)) > CORNER:
@@ -321,8 +321,8 @@ def _rests_unstably(case):
 def judge_derivative(case, told, mine, direction, tol, again=None):
     """The verdict on d(final state) along a direction; mine: the engine's run of the case.
 
-    What the tolerance lets them err is that of disturbed runs, as for states. "tolerance": some of
-    these pass other events, and what `again` tells with a thousandth of the tolerance is right.
+    Disturbed runs show the error that the tolerance allows, as for states. "tolerance": some
+    pass other events, and the answer of `again` to a thousandth of the tolerance is right.
     """
     if case.distance is None and mine.margin <= CORNER:
         return _judge_beside(case, told, direction)
@@ -333,7 +333,7 @@ def judge_derivative(case, told, mine, direction, tol, again=None):
     others, leaves = [], False
     for i in range(DISTURBED):
         for noise in (tol, 10 * tol):
-            # Its start, too: on an arc without events nothing else is disturbed.
+            # The start is disturbed, too: on an arc without events nothing else is.
             shift = noise * np.random.default_rng(i).uniform(-1, 1, 2) * (1 + np.abs(case.y0))
             other = replace(case, y0=tuple(np.array(case.y0) + shift))
             disturbed = run(other, noise=noise, seed=i)
@@ -341,13 +341,13 @@ def judge_derivative(case, told, mine, direction, tol, again=None):
                 others.append(derivatives.derivative(other, disturbed, direction))
             else:
                 leaves = True
-    # There is none where one of them is tangent to what it meets.
+    # A run that is tangent to a boundary or edge has no derivative.
     others = [other for other in others if np.all(np.isfinite(other))]
     far = np.max(np.abs(np.array(others) - right)) if others else 0.0
     if np.all(np.abs(told - right) <= STEPS * far + 1e-7 * size):
         return "same", right
     if leaves and again:
-        # What passes other events there is beyond the accuracy that was asked for.
+        # The tolerance does not determine the events: the answer to a smaller one decides.
         closer = 1e-3 * tol
         found, _ = judge_derivative(case, again(case, direction, closer), mine, direction, closer)
         return ("tolerance" if found == "same" else "derivative"), right
@@ -355,8 +355,8 @@ def judge_derivative(case, told, mine, direction, tol, again=None):
 
 
 def judge_derivative_at_focus(case, told, run, direction):
-    """The verdict on the derivative of a run that ends in a pseudo-focus: it lies on an edge, and
-    moves with it, whatever the start; run: what the package told."""
+    """The verdict on the derivative of a run that ends in a pseudo-focus, which is on an edge and
+    moves with it, whatever the start; run: the package's answer."""
     bounds = [edge for belt in case.oscillator.belts for edge in (belt.lower, belt.upper)]
     moves = [edge for belt in direction[2] for edge in belt[2:]]
     right = np.array([next(d for b, d in zip(bounds, moves) if b == run.x1), 0.0])
@@ -364,7 +364,7 @@ def judge_derivative_at_focus(case, told, run, direction):
 
 
 def _judge_beside(case, told, direction):
-    """The verdict on a derivative in a corner, which is there where those on both sides agree."""
+    """The verdict on a derivative in a corner: it exists if those on both sides agree."""
     if _rests_unstably(case):
         return "corner", np.full(2, np.nan)
     both = []
@@ -385,7 +385,7 @@ def _judge_beside(case, told, direction):
 # ---------------------------------------------------------------- attractors
 
 
-#: A motion as small as this repeats to what is usually asked although it shrinks.
+#: A smaller motion repeats to the usual tolerance although it still shrinks.
 SMALL = 1e-4
 
 
@@ -398,7 +398,7 @@ def label_difference(told, mine, slowest=1.0):
     if told.kind != mine.kind:
         return f"{told.kind}, not {mine.kind}"
     room = 1e-5
-    if mine.kind != "cycle" and np.isnan(told.x1[0]):  # not told by `find_cycle`
+    if mine.kind != "cycle" and np.isnan(told.x1[0]):  # `find_cycle` gives none
         return None
     if mine.kind != "cycle":
         return None if abs(told.x1[0] - mine.x1[0]) <= room else f"another {mine.kind}"
@@ -412,7 +412,7 @@ def label_difference(told, mine, slowest=1.0):
 
 
 def judge_label(case, told, tol, again=None):
-    """The verdict on a label, and the engine's; again(case, tol): asks for another label."""
+    """The verdict on a label, and the engine's label; again(case, tol): the package's at `tol`."""
     mine = engine.attractor(case.oscillator, case.y0)
     if mine.kind == "cycle" and max(np.ptp(mine.x1), np.ptp(mine.x2)) < SMALL:
         mine = engine.attractor(case.oscillator, case.y0, same=1e-13, at_rest=1e-8)
@@ -423,11 +423,11 @@ def judge_label(case, told, tol, again=None):
         return "same", mine
     resting = ("equilibrium", "stuck")
     if told.kind in resting and mine.kind in resting:
-        # A node where a belt at rest could hold the mass: never quite there, or there by rounding.
+        # At a node where a belt at rest could hold the mass, rounding decides whether it arrives.
         if abs(told.x1[0] - mine.x1[0]) <= CORNER:
             return "tolerance", mine
     if again and what == "another cycle":
-        # Where a cycle attracts weakly the tolerance moves it further.
+        # Where a cycle attracts weakly, errors of the tolerance displace it further.
         if label_difference(again(case, 1e-3 * tol), mine, slowest) is None:
             return "tolerance", mine
     if case.distance is None and (mine.margin <= CORNER or mine.status == engine.CORNER):
@@ -439,18 +439,18 @@ def judge_label(case, told, tol, again=None):
     return what, mine
 
 
-#: Moves of a number by which the derivative of a period is asked again: a cycle's states are
-#: promised to 1e-10.
+#: Shift of an edge or boundary after which the derivative of a period is computed again: a cycle's
+#: states are promised to 1e-10.
 SHIFT = 1e-10
-#: Steps of differences with which the engine tells how good its own derivative is.
+#: Other steps of differences, which show the accuracy of the engine's own derivative.
 OTHER_STEPS = 1e-4, 1e-5
 
 
 def judge_period_derivative(case, told, label, direction):
     """The verdict on d(period) of a cycle along a direction, and the engine's.
 
-    Near grazing it changes fast: the room is what moving the edge or boundary by `SHIFT` changes.
-    Where a belt creeps, the engine's own derivative is good to a millionth only.
+    Near grazing the derivative changes fast: the tolerance is its change as the edge or boundary
+    moves by `SHIFT`. Where a belt creeps, the engine's derivative is good to a millionth only.
     """
     right = derivatives.of_period(case, label, direction)
     if np.isnan(told):

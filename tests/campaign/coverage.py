@@ -1,8 +1,8 @@
 """Intervals of `fit`: how many contain the truth.
 
-Records of stick-slip motions of random oscillators, by the engine, with noise of known size. Of
-each a velocity, a coefficient of friction and the damping are fitted, from a guess ten per cent
-off. Of the 95 % intervals, estimate +- 1.96 standard errors, 90 to 98 % have to contain the truth.
+The engine makes records of stick-slip motions of random oscillators, with noise of known size. In
+each record a velocity, a coefficient of friction and the damping are fitted, from a guess at most
+10 % off. Of the 95 % intervals (+- 1.96 standard errors), 90 to 98 % have to contain the truth.
 """
 
 import equinox as eqx
@@ -16,9 +16,9 @@ from .outcome import Outcome
 
 #: Samples of a record and the time between two; noise over the width of the motion.
 SAMPLES, STEP, NOISE = 400, 0.1, 0.01
-#: How far off the guess is, at most; the half width of the interval in standard errors.
+#: Largest relative error of the guess; half-width of the interval in standard errors.
 OFF, HALF = 0.1, 1.959964
-#: The share of intervals that contain the truth.
+#: Smallest and largest share of intervals that contain the truth.
 LEAST, MOST = 0.90, 0.98
 
 
@@ -27,7 +27,7 @@ def random_record(rng):
     while True:
         osc = cases.random_case(rng, (("conti",), False)).oscillator
         seen = engine.attractor(osc, (3.0, 0.0))
-        # What hardly sticks tells little of the static friction.
+        # A motion that hardly sticks hardly depends on the static friction.
         if seen.kind == "cycle" and seen.period < 20 and 0.1 < max(seen.sticks) < 0.9 * seen.period:
             return osc, seen
 
@@ -56,7 +56,7 @@ def outcome(options, number: int) -> Outcome:
 
 
 def _samples(osc, y0, ts) -> np.ndarray:
-    """The displacement at times, by runs of the engine from one to the next."""
+    """Displacements at times, by runs of the engine from each time to the next."""
     state, before, found = tuple(y0), 0.0, []
     for t in ts.tolist():
         state, before = engine.simulate(osc, state, t - before).y_end, t
@@ -84,7 +84,7 @@ def said(counts, largest) -> list[str]:
 
 
 def holds(counts) -> bool:
-    """Whether as many contain the truth as should, as far as so many intervals show it."""
+    """Whether the share lies between LEAST and MOST, up to two of its standard errors."""
     n = counts["intervals"]
     room = 2 * np.sqrt(0.05 * 0.95 / n) if n else 1.0
     return not n or LEAST - room < counts["with the truth"] / n < MOST + room

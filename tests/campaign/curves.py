@@ -2,9 +2,9 @@
 
 Along random paths, those of the campaign `paths`, `scan` finds points. One of them is followed in
 the parameter of the path and a second one, drawn at random. On both sides of some of its rows,
-along the parameter across which the curve runs, the engine has other labels; it starts from many
-states, from the cycle that a row tells of, and from all that `portrait` finds beside. And with the
-parameters in the other order it has to be the same curve, with the same ends.
+along the parameter most transverse to it, the engine must have different labels; it starts from
+many states, from the row's cycle, and from all cycles that `portrait` finds on both sides. With the
+parameters in the other order the curve must be the same, with the same ends.
 """
 
 import jax
@@ -15,9 +15,9 @@ import jaxbelt as jb
 from . import package, paths
 from .outcome import Outcome
 
-#: Rows that are asked of a curve, and how far from a row both sides are, in units of the spans.
+#: Number of rows checked on a curve, and distance of both sides from a row, in units of the spans.
 ROWS, BESIDE = 5, 2e-3
-#: Width of the span of the second parameter: of its size, and at least.
+#: Width of the second parameter's span over the parameter's size, and smallest such size.
 WIDTH, LEAST = 0.3, 0.1
 #: Rows of one curve that are farther from the chords of another one, in units of the spans, are
 #: not on it: chords of bent curves are off by a tenth of a step.

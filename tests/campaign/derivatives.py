@@ -1,8 +1,8 @@
 """Derivatives of a run's final state, by the engine: arc by arc, with the shift of every event.
 
 Along an arc a derivative is that of the flow of one smooth field for a fixed duration, a central
-difference, extrapolated. At an event the time shifts by as much as the disturbance is off the line
-over the speed towards it. So nothing is differenced across an event, however near to grazing.
+difference, extrapolated. At an event the time shifts by the distance of the disturbed state from
+the line over the speed towards it. So no difference is taken across an event, even near grazing.
 """
 
 from dataclasses import replace
@@ -17,9 +17,9 @@ _STEP = 3e-5
 
 
 def directions(case, rng):
-    """A direction in which to disturb start and parameters: (of y0, of damping, of belts).
+    """A random direction in which to disturb start and parameters: rates of (y0, damping, belts).
 
-    Of a belt: of its velocity, load, lower and upper edge. What is equal stays equal.
+    For each belt: rates of velocity, load, lower and upper edge. Equal numbers have equal rates.
     """
     tied = {}
 
@@ -57,7 +57,7 @@ def moved(osc, direction, by):
 
 
 def _difference(f, step, size=1.0):
-    """The derivative of f at 0, by Richardson; size: of the disturbance by one."""
+    """Derivative of f at 0, by Richardson extrapolation; size: disturbance per unit of argument."""
     step = step / max(size, 1.0)
     one, half = ((f(h) - f(-h)) / (2 * h) for h in (step, 0.5 * step))
     return (4 * half - one) / 3

@@ -1,8 +1,8 @@
-"""What `design` finds, against the engine's attractor at the parameters that it tells.
+"""`design` against the engine's attractor at the parameters that it returns.
 
-A random oscillator that sticks is moved by up to a tenth in one or two of its numbers. What a
-functional of the engine's cycle is there is wanted of the oscillator as it was. So there is an
-answer, and at the one that is told the engine's cycle, from the same start, has to have the value.
+One or two numbers of a random oscillator that sticks are changed by up to a tenth. The value of a
+functional of the engine's cycle there is the target of a design from the unchanged oscillator. So a
+solution exists, and at the returned one the engine's cycle, from the same start, has this value.
 """
 
 import functools
@@ -14,9 +14,9 @@ import jaxbelt as jb
 from . import coverage, engine, package, paths, units
 from .outcome import Outcome
 
-#: How far the numbers are moved, at most; how far off the engine's value may be, of its size.
+#: Largest relative change of the numbers; largest relative error of the engine's value.
 MOVED, ROOM = 0.1, 1e-7
-#: What of a small value counts as its size.
+#: Smallest size of a value in relative errors.
 SMALLEST = 1e-2
 START = (3.0, 0.0)
 
@@ -33,13 +33,13 @@ def _largest(cycle):
     return cycle.x1_max
 
 
-#: Which numbers may change, as of `paths`.
+#: Sets of parameters that change, as `paths` names them.
 CHANGED = (
     ((0, "velocity"),),
     ((0, "velocity"), (0, "load")),
     ((0, "law static"), (-1, "damping")),
 )
-#: Functionals: as a design is given them, of the engine's attractor, and whether they are lengths.
+#: Functionals: as `design` gets them, of the engine's attractor, and whether they are lengths.
 WANTED = (
     (jb.amplitude, lambda seen: 0.5 * (seen.x1[1] - seen.x1[0]), True),
     (_period, lambda seen: seen.period, False),
@@ -83,7 +83,7 @@ def outcome(options, number: int) -> Outcome:
 
 @functools.cache
 def _selector(changed):
-    """One function for the same numbers, so that what is compiled for it serves all cases."""
+    """The same function for the same parameters, so that compiled programs serve all cases."""
     return lambda osc: tuple(paths.selector(parameter)(osc) for parameter in changed)
 
 
@@ -94,7 +94,7 @@ def _at(osc, changed, values):
 
 
 def _seen(osc: engine.Oscillator, measured) -> float:
-    """The functional of the engine's cycle; NaN: it has none."""
+    """Value of the functional of the engine's cycle; NaN if no cycle sticks."""
     seen = engine.attractor(osc, START)
     return float(measured(seen)) if seen.kind == "cycle" and max(seen.sticks) > 0 else np.nan
 

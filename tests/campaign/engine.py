@@ -1,4 +1,4 @@
-"""Belt-driven dry-friction oscillators once more, quickly and independently, for campaigns.
+"""A fast and independent second code for belt-driven dry-friction oscillators, for campaigns.
 
 A mass on a spring is dragged by belts, in scaled time
 
@@ -19,11 +19,11 @@ beginning of its own step, so its state is as good as the integration.
 What follows an event is decided by Filippov's set of forces at that very point: belts at the
 mass's own velocity give anything up to their static limits, and if that can balance the rest of the
 forces the mass sticks, else it is accelerated to one side. Belts that slipped before and go on
-touching keep their sign. Stick phases are written down.
+touching keep their sign. Stick phases are computed in closed form.
 
-Codes of contact, a belt each: 1, -1 slips with that sign of r; 0 stuck; -2, 2 mass below, above the
-interval. Kinds of events: 1 STICK, 2 SLIP, 3 CROSS, 4 EDGE; and, where asked for, 5 a zero of x2
-and 6 an extremum of x2.
+Contact codes, one for each belt: 1, -1 slips with that sign of r; 0 stuck; -2, 2 mass below, above
+the interval. Kinds of events: 1 STICK, 2 SLIP, 3 CROSS, 4 EDGE; and, where asked for, 5 a zero of
+x2 and 6 an extremum of x2.
 """
 
 from dataclasses import dataclass, field, replace
@@ -35,7 +35,7 @@ from scipy.integrate._ivp import dop853_coefficients as _dop853
 
 STICK, SLIP, CROSS, EDGE, TURN, EXTREMUM = 1, 2, 3, 4, 5, 6
 OK, STUCK_FOREVER, PSEUDO_FOCUS, NOT_FINITE = 0, 1, 2, 5
-#: The engine's own: the events used up, no progress in a corner, too many steps.
+#: Statuses of the engine only: too many events, no progress in a corner, too many steps.
 BUDGET, CORNER, STEPS = 100, 101, 102
 
 _N = _dop853.N_STAGES
@@ -48,8 +48,8 @@ _E5 = np.ascontiguousarray(_dop853.E5)
 _LONGEST, _SHORTEST = 0.5, 1e-10
 #: Distances above this one need no closer look; below it the margin of a run is exact.
 _CLOSE = 1e-6
-#: Velocity at an edge below which turns around a pseudo-focus are over that shrink as they should,
-#: to this fraction of it.
+#: Largest |x2| at an edge at which a run may end in a pseudo-focus, and largest relative error of
+#: the rate at which its turns around the edge shrink.
 _FOCUS_SPEED, _FOCUS_MATCH = 1e-2, 0.1
 #: A turn with a smaller velocity is smaller than the rounding of x1.
 _ROUNDING = 1e-7
@@ -164,8 +164,8 @@ def simulate(
     mode: contact codes to go on with, None: those of the state. noise: a tolerance, as rtol and
     atol; every step of length h is disturbed by noise (1 + |y|) h, the state after every event by
     noise (1 + |y|), at random. turns, extrema: record the zeros of x2 (belt 0: a maximum of x1, 1:
-    a minimum), the extrema of x2. capture: end, at rest, where the run converges to a pseudo-focus.
-    max_steps: beside a thousand for each unit of time.
+    a minimum), the extrema of x2. capture: whether to end, at rest, where a run converges to a
+    pseudo-focus. max_steps: limit of steps, plus a thousand for each unit of time.
     """
     n = len(osc.belts)
     given = np.full(n, 9, np.int64) if mode is None else np.array(mode, np.int64)
@@ -280,7 +280,7 @@ def _law_interval(row, ra, rb):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _force(z, w, B, s, x1, x2):
-    """x2' in the mode s; of stuck belts nothing. NaN where a law is far beyond its boundary."""
+    """x2' in the mode s; stuck belts add nothing. NaN where a law is far beyond its boundary."""
     f = -x1 - z * x2
     for i in range(B.shape[0]):
         if s[i] == 1 or s[i] == -1:
@@ -325,8 +325,8 @@ def _advance(z, w, B, s, x1, x2, a, h, V, K):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _jumps(w, B, s, V):
-    """Whether a step goes further, in the speed of a belt, than the law's own scale and the
-    smallest speed allow: its error tells nothing of a narrow layer between two stages."""
+    """Whether the relative speed of a belt changes in a step by more than the scale of its law and
+    the smallest speed allow: error estimates miss narrow layers between two stages."""
     low, high = V[0], V[0]
     for j in range(_N + 1):
         low, high = min(low, V[j]), max(high, V[j])
@@ -397,7 +397,7 @@ def _force_interval(z, w, B, s, l1, u1, l2, u2):
 def _enclose(z, w, B, s, x1, x2, a, y1, y2, b, h, box):
     """Bounds of x1, x2, x2', x2'' over the step, into `box`; False where none were found.
 
-    A box is one if Picard's iteration maps it into itself.
+    A box encloses the step if Picard's iteration maps the box into itself.
     """
     room = 0.1 * abs(y2 - x2) + 0.05 * h * (abs(a) + abs(b)) + 1e-300
     l2, u2 = min(x2, y2) - room, max(x2, y2) + room
@@ -415,7 +415,7 @@ def _enclose(z, w, B, s, x1, x2, a, y1, y2, b, h, box):
         l2, u2 = min(l2, n_l2 - room), max(u2, n_u2 + room)
     if not found:
         return False
-    # Once more from both ends.
+    # The box is tightened from both ends of the step.
     l2, u2 = max(n_l2, y2 - max(0.0, h * high)), min(n_u2, y2 - min(0.0, h * low))
     l2, u2 = min(l2, min(x2, y2)), max(u2, max(x2, y2))
     l1, u1 = (
@@ -478,8 +478,8 @@ def _root(z, w, B, s, x1, x2, a, what, level, left, right, f_left, f_right, V, K
 def _look(z, w, B, s, x1, x2, a, y1, y2, b, h, axis, level, side, box, V, K):
     """Whether side (x_axis - level), positive at first, is negative within the step.
 
-    Returns (verdict, length, state, distance): 0 no, 1 at that length, 2 cannot tell; and how far
-    from the line a loop in the step is, on either side of it.
+    Returns (verdict, length, x1, x2, distance). verdict: 0 no, 1 yes, first at that step length, 2
+    undecided. distance: from the line to the path's turning point within the step, on either side.
     """
     if axis == 0:
         g0, g1, d0, d1 = side * (x1 - level), side * (y1 - level), side * x2, side * y2
@@ -525,7 +525,7 @@ def _look(z, w, B, s, x1, x2, a, y1, y2, b, h, axis, level, side, box, V, K):
         right, f_right = h, side * g1
     left, f_left = 0.0, side * g0
     if g0 <= 0:
-        # It began on the line: some way off there is the other side, or it never was left.
+        # The step began on the line: look for a length at which it is on the positive side.
         left = 0.5 * right
         for _ in range(60):
             m1, m2 = _advance(z, w, B, s, x1, x2, a, left, V, K)
@@ -550,7 +550,7 @@ def _look(z, w, B, s, x1, x2, a, y1, y2, b, h, axis, level, side, box, V, K):
 def _contacts(w, B, x1, x2, on, right, old, new):
     """The contacts at a point, into `new`: 0 where a touching belt runs at the velocity `on`.
 
-    right: on which side of an edge it counts that x1 is on. A belt that slipped and goes on
+    right: whether an x1 on an edge counts as to the right of it. A belt that slipped and goes on
     touching keeps its sign.
     """
     for i in range(B.shape[0]):
@@ -568,8 +568,8 @@ def _contacts(w, B, x1, x2, on, right, old, new):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _balance(z, w, B, s, x1, x2):
-    """Sticks, or goes to one side: sets the zeros in s. Returns (sticks, distance from doing the
-    other, sign of x2' after)."""
+    """Decides whether the mass sticks to the belts with code 0; if not, sets these codes in s to a
+    slip. Returns (sticks, distance from the other outcome, sign of x2' after)."""
     held = 0.0
     any_zero = False
     for i in range(B.shape[0]):
@@ -581,7 +581,7 @@ def _balance(z, w, B, s, x1, x2):
         return False, np.inf, np.sign(rest)
     if abs(rest) <= held and held > 0:
         return True, held - abs(rest), 0.0
-    # A belt that exerts no force holds nothing; where nothing pulls, either, x2'' = -x2 decides.
+    # Belts without force cannot hold the mass; where no force acts, either, x2'' = -x2 decides.
     onward = np.sign(rest) if rest != 0 else -np.sign(x2)
     for i in range(B.shape[0]):
         if s[i] == 0:
@@ -591,7 +591,7 @@ def _balance(z, w, B, s, x1, x2):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _velocity_at(w, B, x1, x2):
-    """The velocity of a belt that may touch at x1 and at which x2 is, else NaN."""
+    """Velocity of a belt that may touch at x1 and is as fast as the mass, else NaN."""
     for i in range(B.shape[0]):
         v = B[i, 0]
         if B[i, 2] <= x1 <= B[i, 3] and (x2 == v / w or abs(v - w * x2) <= 4e-16 * abs(v)):
@@ -628,7 +628,7 @@ def _begin(z, w, B, x1, x2, s):
         s[i] = right[i] if go_right else left[i]
     stuck = stuck_r if go_right else stuck_l
     if not same and a_l > 0 and a_r <= 0:
-        # Pushed to the edge from both sides, or held on its other side.
+        # The mass is pushed to the edge from both sides, or held on its right-hand side.
         if stuck_r:
             for i in range(n):
                 s[i] = right[i]
@@ -667,9 +667,9 @@ def _nearest(L, x1, x2):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _contraction(z, w, B, left, right, edge):
-    """To leading order a loop around the rest on an edge multiplies x2 there by 1 + (this) |x2|.
+    """Returns (rate, least): a loop around the rest on an edge multiplies x2 by 1 + rate |x2|.
 
-    Also the least speed of a belt that touches: turns have to be well below it.
+    This is to leading order. least: smallest speed of a touching belt; turns must be far slower.
     """
     a_l, a_r = _force(z, w, B, left, edge, 0.0), _force(z, w, B, right, edge, 0.0)
     least = np.inf
@@ -732,7 +732,7 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, max_steps, out):
             end = _force(z, w, B, s, 0.0, x2) + ahead * held
             edge = L[1] if on > 0 else L[0]
             margin = min(margin, abs(edge - end))
-            # The limit of static friction is still held: on an edge the edge comes first.
+            # At the limit of static friction the mass still sticks: an edge at that x1 comes first.
             is_slip = ahead * (edge - end) > 1e-15 * (held + abs(end))
             if not is_slip:
                 end = edge
@@ -762,7 +762,7 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, max_steps, out):
             a = _force(z, w, B, s, x1, x2)
             if abs(x2) + abs(a) < (
                 1e-14 if turns else 1e-300
-            ):  # at rest, for labels but for rounding
+            ):  # at rest; for labels up to rounding
                 t = T
                 break
             if turns:
@@ -791,7 +791,7 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, max_steps, out):
                 if _jumps(w, B, s, V) and h > _SHORTEST:
                     h *= 0.5
                     continue
-                # What is near enough to be looked at.
+                # Whether a line is near enough to need a closer look.
                 low2 = high2 = x2
                 for j in range(_N + 1):
                     low2, high2 = min(low2, V[j]), max(high2, V[j])
@@ -868,12 +868,12 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, max_steps, out):
                 if belt < 0:
                     kind, belt = TURN, 0 if hit == 2 else 1
                 else:
-                    # Which side of an edge does not matter, for x1 is on none.
+                    # The side of an edge does not matter, because x1 is on no edge.
                     _contacts(w, B, x1, x2, on, x2 > 0, old, s)
                     stuck, gap, _ = _balance(z, w, B, s, x1, x2)
                     margin = min(margin, gap)
                     if not stuck and t == t_before and gap < 1e-12:
-                        # Back at once: at the limit, but for rounding, and within it next.
+                        # Met again at once: needed is the limit up to rounding; the mass sticks.
                         _contacts(w, B, x1, x2, on, x2 > 0, old, s)
                         stuck = True
                     kind = STICK if stuck else CROSS
@@ -933,7 +933,7 @@ def _run(z, w, B, x1, x2, given, T, tol, noise, seed, flags, max_steps, out):
         count += 1
         still = still + 1 if t == t_before else 0
         if still > 20:
-            # Turns around a point on an edge that are lost in rounding are over, too.
+            # Turns around a point on an edge that are smaller than rounding end there, too.
             status = PSEUDO_FOCUS if kind == EDGE and abs(x2) < _ROUNDING else CORNER
             x2 = 0.0 if status == PSEUDO_FOCUS else x2
         if noise > 0:
@@ -963,8 +963,8 @@ def _flow(z, w, B, s, x1, x2, duration, steps):
 
 
 def flow(osc, mode, y, duration, step=0.01):
-    """The state after a time, negative too, in the field of a slip mode; no events are looked
-    for. NaN where the field ends."""
+    """The state after a duration, which may be negative, in the field of a slip mode; events are
+    ignored. NaN where the field ends."""
     if not np.all(np.isfinite([*y, step])):
         return np.nan, np.nan
     steps = max(1, round(abs(duration) / step))
@@ -983,9 +983,9 @@ def force(osc, mode, x1, x2):
 
 @dataclass(frozen=True)
 class Attractor:
-    """kind: "equilibrium", "cycle", "stuck" or "undecided"; loop: the events of one period, (kind,
-    belt) each, from where their order is least; sticks: time stuck to each belt in one period; y: a
-    state on it, of a cycle a maximum of x1."""
+    """kind: "equilibrium", "cycle", "stuck" or "undecided"; loop: events (kind, belt) of one
+    period, rotated so that their sequence is smallest; sticks: time stuck to each belt in one
+    period; y: a state on it, of a cycle a maximum of x1."""
 
     kind: str
     period: float = nan
@@ -999,7 +999,7 @@ class Attractor:
 
 
 def attractor(osc, y0, *, chunk=100.0, t_max=200_000.0, same=1e-9, at_rest=1e-6, periods=24):
-    """Where a run leads, by running it on, in longer and longer pieces.
+    """The attractor of a run, which is continued in longer and longer pieces.
 
     It is a cycle where all of the maxima of x1 in the second half of a piece repeat, as whole
     states, to `same`; an equilibrium where the motion has shrunk below `at_rest` and does shrink.
@@ -1048,7 +1048,7 @@ def attractor(osc, y0, *, chunk=100.0, t_max=200_000.0, same=1e-9, at_rest=1e-6,
 
 
 def _repeats(run, tops, same, periods):
-    """First and last event of one period, where the tops repeat."""
+    """First and last event of one period, a range of `run`, if the tops repeat; else None."""
     y, codes = run.y[tops], run.codes[tops]
     half = len(tops) // 2
 
@@ -1057,14 +1057,14 @@ def _repeats(run, tops, same, periods):
         return np.all(close) and np.array_equal(codes[half:], codes[half - lag : -lag])
 
     def extent(p, before):
-        """Of the loop that ends so many tops before the last one."""
+        """Widths in x1 and x2 of the loop of p tops that ends `before` tops before the last."""
         last = len(tops) - 1 - before
         return np.ptp(run.y[tops[last - p] : tops[last] + 1], axis=0)
 
     for p in range(1, min(periods, half // 4) + 1):
         if alike(p):
-            # And against what creeps as many periods apart as there are; the tops of loops around
-            # an edge that pushes hard tell little of how they shrink.
+            # Creep shows over as many periods as there are. Extents are compared, too: the tops of
+            # loops around an edge that pushes hard hardly show that the loops shrink.
             far = half // p * p
             is_cycle = alike(far) and np.all(np.abs(extent(p, 0) - extent(p, far)) <= same)
             return (tops[-1 - p], tops[-1]) if is_cycle else None

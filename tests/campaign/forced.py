@@ -1,15 +1,15 @@
-"""Forced belt-driven oscillators once more, quickly and independently, for campaigns.
+"""A fast and independent second code for forced belt-driven oscillators, for campaigns.
 
-A mass on a spring is dragged by belts and pushed by forces that know the time,
+A mass on a spring is dragged by belts and pushed by forces that depend on time,
 
     x1' = x2
     x2' = -x1 - zeta x2 + sum over touching belts of  u_i(t) mu_i(|r_i|) sgn(r_i)
           + sum over j of  F_j cos(Omega_j t + phi_j),            r_i = nu_i(t) - omega x2.
 
-Velocities nu_i and loads u_i >= 0 of belts may oscillate, each with a frequency of its own. Nothing
-here comes from the package. What is shared with `engine`, the engine of autonomous runs, is the
-table of DOP853 and the estimate of its error, at 1e-13; boundaries that move with time, forces with
-a clock and stick phases that bend ask for the rest anew.
+Velocities nu_i and loads u_i >= 0 of belts may oscillate, each with its own frequency. Nothing here
+comes from the package. It shares with `engine`, the engine of autonomous runs, the coefficients of
+DOP853 and the estimate of its error, at 1e-13; the rest is different because boundaries move with
+time, forces depend on it, and stick phases are curved.
 
 Slip arcs. A step that may come near a boundary r_i = 0 or an edge of a contact interval has to
 show, by interval arithmetic over an enclosure of the whole step in state and time, that the
@@ -27,41 +27,41 @@ All are explicit functions of the time, and their first root is found by the sam
 of their first and second derivatives over an interval of time. A double root touches and the phase
 goes on; a triple root passes. A phase is for ever (status STUCK_FOREVER) where x1 does not drift
 and the limits hold for all phases of all waves, or over one period that all frequencies have in
-common; such a run goes on to its final time, for a belt may swing.
+common; such a run goes on to its final time, because the belt may oscillate.
 
-What follows an event is decided by the forces at that very point. Z are the touching belts with
-r = 0. Each velocity among those of Z is tried: sticking to it asks for a friction that the belts of
-that velocity can exert, while the signs of the others are those of the differences of velocities
-just afterwards. The belt that the mass is stuck to comes first, then the one that was met. If none
-can hold it, the mass slips with the only signs that agree with its acceleration. At |needed| =
-capacity exactly, the derivatives of |needed| - capacity decide.
+The forces at the point of an event decide what follows. Z are the touching belts with r = 0. Each
+velocity among those of Z is tried: the mass can stick to it if the belts of that velocity can exert
+the friction needed, while the signs of the others are those of the differences of velocities just
+afterwards. The belt that the mass is stuck to is tried first, then the one that was met. If no
+velocity can be held, the mass slips with the only signs that agree with its acceleration. Where
+|needed| = capacity exactly, the derivatives of |needed| - capacity decide.
 
 A mass may also rest on an edge to which it is pushed from both sides. A run that starts there, or
-whose loops around such a point are lost in the rounding of x1, ends at that time with the status
-PSEUDO_FOCUS: when it leaves, and whether, is not told.
+whose loops around such a point become smaller than the rounding of x1, ends at that time with the
+status PSEUDO_FOCUS; whether and when the mass leaves is not computed.
 
-Codes of contact, a belt each: 1, -1 slips with that sign of r; 0 stuck; -2, 2 mass below, above the
-interval. Kinds of events:
+Contact codes, one for each belt: 1, -1 slips with that sign of r; 0 stuck; -2, 2 mass below, above
+the interval. Kinds of events:
 
 - STICK k: the mass sticks to belt k, from a slip arc, or from another belt to which it was stuck;
 - SLIP k: it was stuck to belt k and slips on all belts;
 - CROSS k: r_k changes its sign, in a slip arc, or while the mass goes on sticking to another belt;
-- EDGE k: the mass enters or leaves the interval of belt k, whatever else that ends.
+- EDGE k: the mass enters or leaves the interval of belt k, which may also end a stick phase.
 
-Where several belts are concerned at once the event names the lowest. A start is resolved without an
-event. How it is used:
+Where several belts are concerned at once the event names the lowest number. The mode at the start
+is found without an event. Usage:
 
     belt = Belt(1.0, ("cubic", 1.5, 1.5, 0.45))
     osc = Oscillator(0.0, (belt,), (Harmonic(0.1, 1.7077),))
     run = simulate(osc, (0.5, 0.0), 60.0)            # from t = 0, the time of the cosines, to 60
     run.t, run.sequence, run.y, run.codes            # events (t; (kind, belt); (x1, x2); codes)
     run.y_end, run.mode_end, run.status, run.margin
-    simulate(osc, (0.5, 0.0), 60.0, noise=1e-10, seed=3)     # disturbed by as much as a tolerance
+    simulate(osc, (0.5, 0.0), 60.0, noise=1e-10, seed=3)     # disturbed by the size of a tolerance
 
 `margin` is the smallest distance from another outcome that the run has met: compare sequences only
-where it is well above the accuracy of the code under test. Random and round-numbered oscillators,
-batches of runs on several threads, what a tolerance may change and the verdict on another code's
-answer are in `forced_cases`.
+where it is well above the accuracy of the code under test. `forced_cases` has random and round
+oscillators, batches of runs on several threads, the effect of a tolerance, and the verdict on
+another code's answer.
 """
 
 from dataclasses import dataclass, field
@@ -120,16 +120,16 @@ _NODES, _WEIGHTS = 0.5 * (1 + _NODES), 0.5 * _WEIGHTS
 
 #: Longest step; shortest that is still halved.
 _LONGEST, _SHORTEST = 0.5, 1e-10
-#: Steps of one stick phase; then it is not known how it ends.
+#: Most steps of one stick phase; after these its end counts as unknown.
 _MOST_ROUNDS = 1_000_000
 #: Distances above this one need no closer look; below it the margin of a run is exact.
 _CLOSE = 1e-6
-#: A distance is zero up to rounding below this many times the size of what it is made of; and
-#: velocities are the same at an instant. Both grow with the time by `_blur`.
+#: A distance below _ROUNDING times the size of its terms is zero up to rounding; velocities with a
+#: relative difference below _SAME are equal at an instant. Both grow with time by `_blur`.
 _ROUNDING, _SAME = 1e-14, 2e-15
-#: An interval of time longer than any: bounds over it hold for ever.
+#: Length of an interval of time that stands for infinity: bounds over it hold for ever.
 _EVER = 1e12
-#: Common periods are sought among ratios of frequencies with denominators up to this.
+#: Largest denominator of the ratios of frequencies for which a common period is found.
 _RATIOS = 64
 #: Columns of `Oscillator.table`: velocity 0-3 and load 4-7 (mean, amplitude, frequency, phase).
 _LOAD, _LOWER, _UPPER, _STATIC, _LAW = 4, 8, 9, 10, 11
@@ -164,7 +164,7 @@ class BaseMotion(Harmonic):
 
 @dataclass(frozen=True)
 class Belt:
-    """velocity, load: numbers or `Oscillating`. law: as of `engine.Belt`, or ("cubic", a0, a1, a3),
+    """velocity, load: numbers or `Oscillating`. law: as in `engine.Belt`, or ("cubic", a0, a1, a3),
     mu(r) = a0 - a1 r + a3 r^3, or ("polynomial", c0, c1, c2, c3)."""
 
     velocity: float | Oscillating
@@ -208,9 +208,9 @@ class Oscillator:
         return np.array(rows, dtype=float)
 
     def clock(self):
-        """The forces as rows (0, amplitude, frequency, phase), one a frequency.
+        """The forces as rows (0, amplitude, frequency, phase), one for each frequency.
 
-        Forces that cancel one another do so in sums of numbers, but not of intervals.
+        They are added here because forces that cancel do not cancel in sums of intervals.
         """
         groups, rows = {}, []
         for f in self.forces:
@@ -261,7 +261,7 @@ def base_motion(damping, amplitude, frequency, phase=0.0):
 
 @dataclass(frozen=True)
 class Run:
-    """Events: t, kind, belt, y = (x1, x2) and the codes after it, a row each. speeds: how fast
+    """Events: t, kind, belt, y = (x1, x2) and the codes after it, a row each. speeds: rate at which
     each event's distance went to zero. margin: the smallest distance from another outcome."""
 
     t: np.ndarray
@@ -347,7 +347,7 @@ def _wave(row, c, t, k):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _blur(t):
-    """How the rounding of a wave's angle grows with the time."""
+    """Factor by which the rounding error of a wave's angle grows with time."""
     return 1 + 0.1 * abs(t)
 
 
@@ -422,7 +422,7 @@ def _mu(row, r):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _steep(row, r, k):
-    """The k-th derivative of the part of a law that is no polynomial: monotone in r."""
+    """The k-th derivative of the part of a law that is not polynomial, which is monotone in r."""
     c = row[13]
     if row[11] == 1:
         f = np.exp(-c * r)
@@ -466,7 +466,7 @@ def _mu_interval(row, ra, rb, k):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _force(z, w, B, F, s, t, x1, x2):
-    """x2' in the mode s; of stuck belts nothing. NaN where a law is far beyond its boundary."""
+    """x2' in the mode s; stuck belts add nothing. NaN where a law is far beyond its boundary."""
     f = -x1 - z * x2
     for j in range(F.shape[0]):
         f += _wave(F[j], 0, t, 0)
@@ -536,8 +536,8 @@ def force(osc, mode, t, x1, x2):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _waves(B, F, s, t, h, E):
-    """Bounds over [t, t + h], into E: of a belt nu, nu', nu'', u, u'; in the last row the forces
-    and their derivative."""
+    """Bounds over [t, t + h], into E: row i has those of nu, nu', nu'', u, u' of belt i, the last
+    row those of the sum of the forces and its derivative."""
     n = B.shape[0]
     for i in range(n):
         if s[i] == 1 or s[i] == -1:
@@ -607,7 +607,7 @@ def _jerk_interval(z, w, B, s, E, l2, u2, al, ah):
 def _enclose(z, w, B, F, s, t, x1, x2, a, y1, y2, b, h, E, box):
     """Bounds of x1, x2, x2', x2'' over the step, into `box`; False where none were found.
 
-    A box is one if Picard's iteration maps it into itself.
+    A box encloses the step if Picard's iteration maps the box into itself.
     """
     _waves(B, F, s, t, h, E)
     room = 0.1 * abs(y2 - x2) + 0.05 * h * (abs(a) + abs(b)) + 1e-300
@@ -627,7 +627,7 @@ def _enclose(z, w, B, F, s, t, x1, x2, a, y1, y2, b, h, E, box):
         l2, u2 = min(l2, n_l2 - room), max(u2, n_u2 + room)
     if not found:
         return False
-    # Once more from both ends.
+    # The box is tightened from both ends of the step.
     l2, u2 = max(n_l2, y2 - max(0.0, h * high)), min(n_u2, y2 - min(0.0, h * low))
     l2, u2 = min(l2, min(x2, y2)), max(u2, max(x2, y2))
     l1 = max(x1 + min(0.0, h * l2), y1 - max(0.0, h * u2))
@@ -656,10 +656,10 @@ def _enclose(z, w, B, F, s, t, x1, x2, a, y1, y2, b, h, E, box):
 def _verdict(g0, g1, d0, d1, h, shift, touch, R):
     """Whether a distance, from g0 > 0 to g1 with slopes d0 and d1, is negative in between.
 
-    R: bounds of the distance, its slope and its curvature over the interval, which are made
-    tighter. shift: what was added to a distance that began at zero. touch: how far below zero a
-    convex distance has not passed it. Returns 0 no, 1 yes, once, 2 perhaps, in a convex loop, 3
-    cannot tell.
+    R: bounds of the distance, its slope and its curvature over the interval; they are tightened.
+    shift: number added to a distance that began at zero. touch: depth below zero down to which a
+    convex distance only touches it. Returns 0 no, 1 yes, once, 2 perhaps, around a minimum of a
+    convex distance, 3 undecided.
     """
     R[2] = max(R[2], max(d0 + min(0.0, h * R[4]), d1 - max(0.0, h * R[5])))
     R[3] = min(R[3], min(d0 + max(0.0, h * R[5]), d1 - min(0.0, h * R[4])))
@@ -741,7 +741,7 @@ def _slip_root(z, w, B, F, s, L, line, order, shift, t, x1, x2, a, right, f_left
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _slip_root_beside(z, w, B, F, s, L, line, t, x1, x2, a, right, V, K):
-    """As `_stick_root_beside`; the length and the state there."""
+    """Root as in `_stick_root_beside`, on a slip arc; returns the length and the state there."""
     left, end, h = 0.0, right, right
     for _ in range(60):
         mean = 0.0
@@ -772,7 +772,7 @@ def _slip_root_beside(z, w, B, F, s, L, line, t, x1, x2, a, right, V, K):
 def _stick_line(z, w, B, F, s, k, start, x1, L, line, t, h, R):
     """Bounds of a distance of a stick phase, of its slope and curvature over [t, t + h], into R.
 
-    The mass is stuck to belt k, and was at x1 at the time `start`. With h = 0 these are values.
+    The mass is stuck to belt k, and was at x1 at the time `start`. With h = 0 bounds are values.
     """
     v0l, v0h = _wave_interval(B[k], 0, t, h, 0)
     v1l, v1h = _wave_interval(B[k], 0, t, h, 1)
@@ -825,7 +825,7 @@ def _stick_line(z, w, B, F, s, k, start, x1, L, line, t, h, R):
         u0l, u0h = _wave_interval(B[i], _LOAD, t, h, 0)
         u1l, u1h = _wave_interval(B[i], _LOAD, t, h, 1)
         u2l, u2h = _wave_interval(B[i], _LOAD, t, h, 2)
-        # s u mu and its derivatives; that of mu(s r) is mu' s r'.
+        # s u mu(s r) and its derivatives, with d mu(s r)/dt = mu' s r'.
         p, q = _product(u0l, u0h, m0l, m0h)
         p, q = (p, q) if s[i] > 0 else (-q, -p)
         R[0], R[1] = R[0] - q, R[1] - p
@@ -885,7 +885,7 @@ def _stick_root(z, w, B, F, s, k, start, x1, L, line, order, shift, left, right,
 def _stick_root_beside(z, w, B, F, s, k, start, x1, L, line, right, R):
     """The root up to the time `right` of a distance that is zero at `start`.
 
-    All its values in between are rounding; its mean slope, which also vanishes there, is not.
+    The distance itself is only rounding there. Its mean slope is not, and has the same root.
     """
     left, end, t = start, right, right
     for _ in range(60):
@@ -935,14 +935,14 @@ def _faster(B, i, k, t):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _holds(z, w, B, F, s, k, t, x1, L, R):
-    """Whether the belts with code 0, all of k's velocity, hold the mass: (holds, distance from
-    doing the other)."""
+    """Whether the belts with code 0, all as fast as belt k, hold the mass; returns (holds, distance
+    from the other outcome)."""
     cap = 0.0
     for i in range(B.shape[0]):
         if s[i] == 0:
             cap += B[i, _STATIC] * _wave(B[i], _LOAD, t, 0)
     if not cap > 0:
-        # A belt that exerts no force holds nothing.
+        # Belts without load or static friction cannot hold the mass.
         _stick_line(z, w, B, F, s, k, t, x1, L, 2, t, 0.0, R)
         return False, abs(R[0])
     gap, held = np.inf, True
@@ -952,7 +952,7 @@ def _holds(z, w, B, F, s, k, t, x1, L, R):
         if abs(R[0]) > _ROUNDING * _blur(t) * (1 + abs(x1) + cap):
             held = held and R[0] > 0
             continue
-        # At the limit: where it goes.
+        # At the limit: derivatives decide whether the distance grows.
         value, slope, curvature = R[0], R[2], R[4]
         if abs(slope) > 1e-12:
             held = held and slope > 0
@@ -967,8 +967,8 @@ def _holds(z, w, B, F, s, k, t, x1, L, R):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _settle(z, w, B, F, t, x1, x2, s, zero, first, second, R):
-    """Sets the codes of the belts in `zero`, which have r = 0. Returns (the belt that the mass
-    sticks to, or -1; distance from another outcome; x2' after)."""
+    """Sets the codes of the belts in `zero`, which have r = 0; first, second: belts to try first.
+    Returns (belt that the mass sticks to, or -1; distance from another outcome; x2' after)."""
     n = B.shape[0]
     L = np.array([-np.inf, np.inf])
     gap = np.inf
@@ -998,7 +998,7 @@ def _settle(z, w, B, F, t, x1, x2, s, zero, first, second, R):
             count += 1
     best, chosen, acceleration = np.inf, 0, 0.0
     for cut in range(count + 1):
-        # order[:cut] are left behind.
+        # Belts order[:cut] are slower than the mass.
         if 0 < cut < count and _mates(B, order[cut - 1], order[cut]):
             continue
         for j in range(count):
@@ -1031,7 +1031,7 @@ def _at_zero(w, B, t, x2, s, k, zero):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _touching(w, B, t, x1, x2, right, old, new):
-    """The contacts at x1, into `new`; right: on which side of an edge it counts that x1 is on."""
+    """The contacts at x1, into `new`; right: whether x1 on an edge counts as to the right of it."""
     for i in range(B.shape[0]):
         if x1 < B[i, _LOWER] or (x1 == B[i, _LOWER] and not right):
             new[i] = -2
@@ -1110,7 +1110,7 @@ def _nearest(w, B, s, L, t, x1, x2):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _stick_phase(z, w, B, F, s, k, start, x1, T, period, L, shifts, R, Q):
-    """The first end of a stick phase: (line, -1: none, -2: not known; time; margin; for ever)."""
+    """End of a stick phase: (line, or -1: none by T, -2: unknown; time; margin; is for ever)."""
     n = B.shape[0]
     lines = 4 + n
     margin = np.inf
@@ -1131,7 +1131,7 @@ def _stick_phase(z, w, B, F, s, k, start, x1, T, period, L, shifts, R, Q):
         for line in range(lines):
             if line < 4 or (abs(s[line - 4]) == 1):
                 _stick_line(z, w, B, F, s, k, start, x1, L, line, start, _EVER, R)
-                # An edge that a belt at rest holds the mass on is not left.
+                # On a belt at rest the mass does not move away from an edge that it is on.
                 least = -touch if line in (2, 3) or B[k, 1] == 0 else touch
                 ever = ever and R[0] >= least
                 margin = min(margin, abs(R[0])) if line in (2, 3) else margin
@@ -1152,7 +1152,7 @@ def _stick_phase(z, w, B, F, s, k, start, x1, T, period, L, shifts, R, Q):
         if rounds > _MOST_ROUNDS:
             return -1 if t >= T else -2, T, margin, False
         h = min(h, until - t)
-        # Up to T exactly.
+        # One step ends at T exactly.
         if t < T < t + h:
             h = T - t
         hit, t_hit, unclear, closest = -1, np.inf, False, np.inf
@@ -1327,7 +1327,7 @@ def _run(z, w, B, F, period, x1, x2, given, t, T, tol, noise, seed, out):
                 if not (abs(y1) + abs(y2) <= 1e9):
                     status = NOT_FINITE
                     break
-                # What is near enough to be looked at.
+                # Whether a line is near enough to need a closer look.
                 near = False
                 low2 = high2 = x2
                 for j in range(_N + 1):
@@ -1440,7 +1440,7 @@ def _run(z, w, B, F, period, x1, x2, given, t, T, tol, noise, seed, out):
                     if s[i] != old[i] and (kind == CROSS or s[i] == 0):
                         same, belt = False, i
                 if same:
-                    # It touched the line within rounding and goes back.
+                    # The path only touched the line, up to rounding.
                     kind, margin = 0, 0.0
             else:
                 x1 = L[hit]
@@ -1458,7 +1458,7 @@ def _run(z, w, B, F, period, x1, x2, given, t, T, tol, noise, seed, out):
                 after = _force(z, w, B, F, s, t, x1, x2)
                 inward = 1.0 if hit == 1 else -1.0
                 if stuck < 0 and abs(x2) < 1e-7 and a * inward > 0 > after * inward:
-                    # Loops around a point on an edge are lost in the rounding of x1.
+                    # Loops around a point on an edge have become smaller than the rounding of x1.
                     status, x2 = PSEUDO_FOCUS, 0.0
         # ---------------- an event
         still = still + 1 if t == t_before else 0
@@ -1486,7 +1486,7 @@ def _run(z, w, B, F, period, x1, x2, given, t, T, tol, noise, seed, out):
                 if kind == EDGE:
                     x2 += 0.0 if stuck >= 0 else move * (1 + abs(x2))
                 elif kind == SLIP:
-                    # Onward, or it would stick again at once.
+                    # In the direction of the slip, or the mass would stick again at once.
                     x1 += s[belt] * abs(move) * (1 + abs(x1))
                 else:
                     x1 += move * (1 + abs(x1))

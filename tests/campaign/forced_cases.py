@@ -1,23 +1,23 @@
 """Cases of forced oscillators, runs of many of them, and verdicts on another code's answers.
 
     rng = np.random.default_rng(0)
-    for structure in structures(rng, 12):            # a structure is a compilation of the package
+    for structure in structures(rng, 12):            # the package compiles once for a structure
         batch = [case(rng, structure) for _ in range(4096)]     # half of them on round numbers
         told = ...                                   # the package's answers, one `Told` a case
         for verdict, mine in judged(batch, told, tol=1e-8, threads=2):
             ...                                      # verdict in GOOD, or what differs
 
 Statuses are those of `engine`. STUCK_FOREVER and OK are the same answer if the state at the final
-time is the same: a run that is held for ever is held until then, and not every code can tell the
-one from the other where frequencies have no common period. Verdicts are those of `compare`:
+time is the same: a run that is held for ever is held until then, and where frequencies have no
+common period not every code can distinguish the two. Verdicts are those of `compare`:
 
 - "same": the engine's sequence, mode, status, and states within what the tolerance allows;
 - "tolerance": the answer of a run that is disturbed by the tolerance at every step and event, or,
-  where such runs have other events than the run, one within what they cover;
+  where disturbed runs have other events than the run, an answer within the range of theirs;
 - "corner": the run comes within 1e-9 of another outcome, where rounding decides, and the answer is
   that of a neighbour, whose numbers are moved by 1e-7; or the engine stops at a pseudo-focus, and
   the events until then are the same;
-- otherwise what is different, in a word or two.
+- otherwise the difference, in a word or two.
 
 `stick_case` gives stick phases that end at a simple root of |needed| = capacity next to a double
 one, touch it, pass a triple one, or miss it narrowly, together with the time of slip onset from a
@@ -59,9 +59,9 @@ __all__ = [
 ]
 
 GOOD = compare.GOOD
-#: Statuses of another code that took too many arcs or steps, and the engine's own.
+#: Statuses of another code that took too many arcs or steps, and the one of the engine.
 GAVE_UP = (*compare.GAVE_UP, forced.BUDGET)
-#: Events that the engine is given where another code came to an end.
+#: Limit of events for the engine where another code reached the end.
 MOST_EVENTS = 100_000
 LAWS = ("conti", "coulomb", "stribeck", "cubic")
 
@@ -69,8 +69,8 @@ LAWS = ("conti", "coulomb", "stribeck", "cubic")
 @dataclass(frozen=True)
 class Structure:
     """What decides the compiled program: laws of the belts, whether there are edges, the number of
-    forces, which velocities and loads oscillate, and how many forces, the last ones, are those of a
-    support that moves."""
+    forces, which velocities and loads oscillate, and how many forces, the last ones, come from a
+    moving support."""
 
     laws: tuple
     edges: bool
@@ -201,7 +201,7 @@ def structures(rng, programs):
 
 
 def batches(options, size, programs):
-    """A structure and a number of runs, `size` at most, each."""
+    """Pairs of a structure and a number of runs, at most `size`."""
     found = structures(np.random.default_rng(options.seed), programs)
     if options.structure is not None:
         found = found[options.structure : options.structure + 1]
@@ -250,7 +250,7 @@ def _intervals(structure, number, rng):
 
 
 def random_case(rng, structure, T=60.0):
-    """All numbers at random; one or two frequencies for all that oscillates."""
+    """A case with random numbers; forces, velocities and loads share one or two frequencies."""
     known = rng.uniform(0.3, 2.5, size=rng.integers(1, 3))
 
     def frequency():
@@ -289,8 +289,8 @@ def _round_law(rng, name):
 
 
 def round_case(rng, structure, T=60.0):
-    """Frequencies 1, 1/2 and 2, phases multiples of pi/2, forces equal to capacities, other numbers
-    multiples of 1/20; what can be equal often is."""
+    """A case with frequencies 1, 1/2 and 2, phases multiples of pi/2, forces equal to capacities,
+    other numbers multiples of 1/20, and many equal numbers."""
 
     def number(a, b):
         return round(float(rng.integers(round(20 * a), round(20 * b) + 1)) / 20, 2)
@@ -352,7 +352,7 @@ def _round_start(rng, osc, t0, number):
 
 # ---------------------------------------------------------------- stick phases next to double roots
 
-#: What a stick phase does at the time that it is made for.
+#: What |needed| - capacity does at the time for which a stick phase is made.
 MEETINGS = ("touches", "passes", "misses", "hits")
 
 
@@ -415,10 +415,10 @@ def simulate_all(cases, threads=2, **options):
 
 
 def spread(case, noise, mine):
-    """How far disturbances of a size move the final state and the events' (t, x1, x2) of a run.
+    """Largest changes of the final state and of the events' (t, x1, x2) by disturbances `noise`.
 
-    Times count as distances, at the speed at which each event's line was approached. Returns the
-    two largest distances and the disturbed runs.
+    Times count as distances, at the speed at which each event's line was approached. Returns both
+    changes and the disturbed runs.
     """
     runs = [_disturbed(case, noise, seed, mine) for seed in range(compare.DISTURBED)]
     alike = [r for r in runs if r.sequence == mine.sequence and r.status == mine.status]
@@ -428,7 +428,7 @@ def spread(case, noise, mine):
 
 
 def _disturbed(case, noise, seed, mine):
-    """A disturbed run, with room for twice the events of the one that is not."""
+    """A disturbed run, with room for twice the events of the undisturbed run `mine`."""
     return case.simulate(noise=noise, seed=seed, max_events=max(20_000, 2 * len(mine.t)))
 
 
@@ -501,22 +501,22 @@ def judge(case, told, tol):
 
 
 def _of_focus(told, mine):
-    """The verdict on a run that ended at an edge which pushes back from both sides, where loops
-    shrink; the engine follows these on, and may take no more events than it does."""
+    """The verdict on an answer that ended at an edge which pushes back from both sides, where loops
+    shrink; the engine goes on along them, and may not have fewer events than the answer."""
     n = told.n_events
     if len(mine.t) <= n or (
         told.events and tuple(e[1:3] for e in told.events) != mine.sequence[:n]
     ):
         return "focus that is none"
-    # What is left of loops goes up and down with the force, and shrinks.
+    # The loops that remain grow and shrink with the force, and shrink on the whole.
     speeds = np.abs(mine.y[n - 1 :, 1])
     stays = np.all(np.abs(mine.y[n - 1 :, 0] - told.x1) <= speeds[0])
     return "same" if stays and np.max(speeds) <= 3 * speeds[0] else "focus that is none"
 
 
 def _of_disturbed_runs(case, told, mine, tol):
-    """Whether an answer is that of a disturbed run whose sequence is another one; or, where such
-    runs differ in their number of events, has a number and a state within what these cover."""
+    """Whether an answer is that of a disturbed run with another sequence than the engine's; or, if
+    there are such runs, has a number of events and a state within the range of theirs."""
     others = []
     for seed in range(compare.DISTURBED):
         for noise in (tol, 10 * tol):
@@ -534,7 +534,7 @@ def _of_disturbed_runs(case, told, mine, tol):
         others.append(other)
     rows = np.array([(len(other.t), *other.y_end) for other in others])
     low, high = rows.min(axis=0), rows.max(axis=0)
-    room = 0.5 * (high - low)  # few of many
+    room = 0.5 * (high - low)  # because the runs are few
     row = np.array([told.n_events, told.x1, told.x2])
     alike = told.status in {other.status for other in others}
     return bool(alike and np.all((low - room <= row) & (row <= high + room)))
@@ -543,7 +543,7 @@ def _of_disturbed_runs(case, told, mine, tol):
 def _alike_until(events, mine, t):
     early = [e[1:3] for e in events if e[0] < t]
     right = [pair for s, pair in zip(mine.t, mine.sequence) if s < t]
-    # One more or less where an event is at that time.
+    # Numbers may differ by one, if an event is close to t.
     shared = min(len(early), len(right))
     return abs(len(early) - len(right)) <= 1 and early[:shared] == right[:shared]
 
@@ -563,8 +563,8 @@ def judged(cases: Sequence, told: Sequence, tol, threads=2):
 
 
 def _numbers(case):
-    """All numbers of a case that can be moved, and which of them are one: what is equal, of one
-    kind, stays equal if a direction is `tied`."""
+    """All numbers of a case that can be moved, and a name for each: equal numbers of one kind share
+    a name, and stay equal along a direction that is `tied`."""
     osc = case.oscillator
     values, names = [*case.y0, osc.damping, osc.omega], ["x1", "x2", "damping", "omega"]
 
@@ -594,7 +594,7 @@ def _numbers(case):
 def moved(case, direction, by=1.0):
     """The case with its numbers moved along a direction."""
     values, _ = _numbers(case)
-    # What is infinite stays so.
+    # Infinite numbers stay infinite.
     rest = iter(np.where(np.isfinite(values), values + by * np.asarray(direction), values).tolist())
     y0, damping, omega = (next(rest), next(rest)), next(rest), next(rest)
 
@@ -608,7 +608,7 @@ def moved(case, direction, by=1.0):
         velocity, load = take(b.velocity), take(b.load)
         law = (b.law[0], next(rest), *b.law[2:])
         if law[0] == "coulomb" and b.law[1] == b.law[2]:
-            # The static limit does not come below the kinetic friction.
+            # Both move together, so that the static limit is not below the kinetic friction.
             law = ("coulomb", law[1], law[1])
         belts.append(Belt(velocity, law, load, next(rest), next(rest)))
     forces = tuple(kind(next(rest), next(rest), next(rest)) for kind in case.structure.kinds)
@@ -638,8 +638,8 @@ def neighbours(case, by=compare.NEIGHBOUR, joint=24, seed=0):
 def derivative(case, direction, step=1e-4, levels=4):
     """d(x1, x2 at T) along a direction, by Richardson's differences of the engine.
 
-    Returns (value, error), or None where runs that are so near pass other events. Smaller steps
-    are tried twice.
+    Returns (value, error), or None where the runs of the differences pass other events. Smaller
+    steps are tried twice.
     """
     mine = case.simulate()
     for size in (step, 0.1 * step, 0.01 * step):
@@ -673,10 +673,10 @@ def stroboscopic(osc, y, periods, period=None, **options):
 
 
 def monodromy(osc, y, periods, period=None, h=1e-4):
-    """The derivative of the state after some periods by that before, by differences.
+    """The derivative of the state after some periods by the state before, by differences.
 
-    Two steps, extrapolated: the error is some h^4 and 1e-13/h. Only where runs that are so near
-    pass the same events.
+    Two steps, extrapolated: the error is some h^4 and 1e-13/h. It is valid only where the runs of
+    the differences pass the same events.
     """
 
     def difference(d, h):
@@ -700,8 +700,8 @@ def periodic(osc, guess, periods, period=None, h=1e-4):
 
 
 def exponent(osc, y, periods, size=1e-8, transient=300):
-    """Lyapunov exponent a period, and its standard error, by a neighbour that is brought back to a
-    distance after each period."""
+    """Lyapunov exponent per period, and its standard error, by a neighbour that is moved back to
+    the distance `size` after each period."""
     y = np.array(stroboscopic(osc, y, transient).y_end)
     along, growth = np.array([size, 0.0]), []
     for _ in range(periods + 80):

@@ -25,7 +25,7 @@ def _wave(wave):
 
 
 def oscillator(osc):
-    """The same oscillator as the package's."""
+    """The engine's oscillator as one of the package."""
     belts = tuple(
         jb.Belt(_wave(b.velocity), LAWS[b.law[0]](*b.law[1:]), _wave(b.load), b.lower, b.upper)
         for b in osc.belts
@@ -35,7 +35,7 @@ def oscillator(osc):
 
 
 def final(run):
-    """A trajectory that ends with its only sample, as the campaign compares it."""
+    """A trajectory whose only sample is at its end, as a `Final` for the comparison."""
     events = jax.tree.map(np.asarray, run.events)
     known = events.kind > 0
     columns = (events.t, events.kind, events.belt, *events.y.T)
@@ -46,7 +46,7 @@ def final(run):
 
 
 def simulated(cases, tol, **options):
-    """Trajectories by `simulate`, one by one; where its budget was too small, with a larger one."""
+    """Trajectories by `simulate`, one by one; MANY_SEGMENTS where the default was too small."""
     out = []
     for case in cases:
         given = dict(t0=case.t0, ts=[case.T], rtol=tol, atol=tol) | options
@@ -71,7 +71,7 @@ def _sizes(case):
 
 
 def _of_numbers(structure, sizes, values, rest):
-    """The start and the oscillator of numbers in the order of `forced_cases._numbers`."""
+    """The start and the oscillator from numbers in the order of `forced_cases._numbers`."""
     values, rest = iter(values), iter(rest)
     y0 = jnp.stack([next(values), next(values)])
     damping, omega = next(values), next(values)
@@ -106,9 +106,9 @@ def _pushed(structure, sizes, tol, max_segments):
 def derivative(case, direction, tol=1e-11, times=(0.0, 0.0), max_segments=2048):
     """d(x1, x2 at T) along a direction of the numbers of a case, and of t0 and T."""
     values, names = forced_cases._numbers(case)
-    # What is infinite has no derivative.
+    # Infinite numbers have no derivative.
     direction = np.where(np.isfinite(values), direction, 0.0)
-    # As `forced_cases.moved` does: Coulomb's law without a jump stays one.
+    # As in `forced_cases.moved`: Coulomb's law without a jump stays without one.
     statics = [d for d, name in zip(direction, names) if name[0] == "static"]
     rest = []
     for b, d in zip(case.belts, statics, strict=True):

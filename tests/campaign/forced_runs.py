@@ -9,11 +9,11 @@ from . import forced, forced_cases, forced_package
 from .outcome import Outcome
 from .runs import said as said
 
-#: Runs in one case, and structures, each a compilation.
+#: Number of runs in one case, and of structures; each structure is a compilation.
 BATCH, PROGRAMS = 128, 14
-#: Runs that are differentiated in the last case of each structure, along one direction each.
+#: Number of runs differentiated in the last case of each structure, along one direction each.
 DIFFERENTIATED = 64
-#: Derivatives of the engine that its own differences know to this fraction.
+#: Largest relative error of a derivative of the engine, by its differences, that is compared.
 KNOWN_TO = 1e-8
 
 
@@ -42,7 +42,7 @@ def outcome(options, number):
 
 
 def compared(batch, told, options) -> Outcome:
-    """What was told of runs of one structure, beside the engine's."""
+    """Compares the package's answers for runs of one structure with the engine's."""
     one = Outcome(f"{len(batch)} runs of {batch[0].structure}")
     verdicts = forced_cases.judged(batch, told, options.tol, options.threads)
     for case, answer, (verdict, mine) in zip(batch, told, verdicts):
@@ -57,7 +57,7 @@ def compared(batch, told, options) -> Outcome:
 
 
 def _differentiate(one, structure, rng):
-    """Derivatives of runs over a shorter time, which grow less."""
+    """Compares derivatives of runs over a shorter time, in which they grow less."""
     for _ in range(DIFFERENTIATED):
         case = forced_cases.random_case(rng, structure, T=20.0)
         size = len(forced_cases._numbers(case)[0])

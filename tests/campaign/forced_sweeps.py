@@ -20,7 +20,7 @@ from .forced_runs import settings as settings
 from .package import Final
 from .runs import said as said
 
-#: Runs in one call, and structures, each a compilation.
+#: Number of runs in one call, and of structures; each structure is a compilation.
 BATCH, PROGRAMS = 1024, 14
 _SIZES = {"conti": 4, "coulomb": 2, "stribeck": 3, "cubic": 3}
 
@@ -41,7 +41,7 @@ def outcome(options, number):
 
 
 def from_zero(case):
-    """The same run that begins at t = 0: all of a sweep begin together."""
+    """The same run shifted to begin at t = 0, because all runs of a sweep begin together."""
 
     def later(wave):
         if not isinstance(wave, forced.Oscillating | forced.Harmonic):
@@ -55,7 +55,7 @@ def from_zero(case):
 
 
 def row_of(case):
-    """All numbers of a case in the order that `_from_numbers` takes them in."""
+    """All numbers of a case in the order that `_from_numbers` expects."""
     osc = case.oscillator
     row = [osc.damping, osc.omega]
     for b in osc.belts:
@@ -90,7 +90,7 @@ def _from_numbers(structure, row):
 
 
 def swept(cases, observe, **options):
-    """The variables of `jb.sweep` over cases of one structure and one T, every number its own."""
+    """Variables of `jb.sweep` over cases of one structure and one T; all numbers vary by case."""
     structure = cases[0].structure
     table = np.array([row_of(case) for case in cases])
     starts = np.array([case.y0 for case in cases], dtype=float)

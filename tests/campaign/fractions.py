@@ -1,4 +1,4 @@
-"""Basin fractions along a parameter: what `basin_fractions` tells against runs by the engine.
+"""Basin fractions along a parameter: those of `basin_fractions` against runs of the engine.
 
 Along nu0 of class (b), nu1 = 0.35, at ten values. The engine runs from the middles of the cells of
 a grid over the box, whose counts err by less than those of starts at random: the boundary of a
@@ -7,8 +7,8 @@ basin is a curve, and only cells that it passes are counted wrong. Three things 
 - At each value there are as many attractors, of the same kinds and at the same places.
 - Each fraction is the engine's, to two standard errors of as many random starts as the engine has;
   `basin_fractions` has more.
-- In standard errors of their own the fractions differ from the engine's as they should: the sum of
-  the squares, one for each value with two attractors, is one that chance gives.
+- The differences from the engine's fractions, in their standard errors, are as large as they should
+  be: chance explains the sum of their squares, one for each value with two attractors.
 
 The last holds for 100,000 starts of the engine or more: the error of a grid falls faster than that
 of random starts, and has to be small beside it.
@@ -31,11 +31,11 @@ from .outcome import Outcome
 
 #: The path, and the box of starts; six of the values have two attractors.
 NU1, SPAN, VALUES, BOX = 0.35, (-0.55, 0.53), 10, ((-1.0, 3.0), (-1.0, 1.0))
-#: Starts of `basin_fractions` for one of the engine.
+#: Starts of `basin_fractions` for each start of the engine.
 MORE = 10
-#: Extrema of one attractor differ by less.
+#: Largest difference between extrema of the same attractor.
 SAME = 1e-4
-#: The sum of squares is beyond what chance gives once in so many campaigns, and so is a fault.
+#: A sum of squares is a fault if chance exceeds it with a smaller probability than this.
 CHANCE = 1e-3
 
 
@@ -44,15 +44,15 @@ Place = tuple[str, float, float]
 
 
 class Seen(NamedTuple):
-    """Attractors at one value, and how many starts lead to each; a kind "undecided" where the
-    engine does not tell."""
+    """Attractors at one value, and how many starts lead to each; the kind "undecided" stands for
+    starts whose attractor the engine does not find."""
 
     places: tuple[Place, ...]
     counts: tuple[int, ...]
 
 
 def by_engine(nu0: float, starts: int, threads: int) -> Seen:
-    """What the engine's runs lead to, from about so many starts on a grid, two by one."""
+    """Attractors of the engine's runs from about `starts` starts on a grid, sides two to one."""
     across = max(1, round(np.sqrt(starts / 2)))
     middles = [
         low + (high - low) * (np.arange(n) + 0.5) / n
@@ -68,7 +68,7 @@ def class_b(nu0: float) -> engine.Oscillator:
 
 
 def of_starts(osc: engine.Oscillator, starts: np.ndarray, threads: int) -> Seen:
-    """What the engine's runs from starts, [n, 2], lead to."""
+    """Attractors of the engine's runs from starts [n, 2]."""
 
     def label(y0) -> Place:
         seen = engine.attractor(osc, tuple(y0))
@@ -88,8 +88,8 @@ def _is_same(one: Place, other: Place) -> bool:
 
 
 def differences(told: jb.BasinFractions, row: int, seen: Seen) -> tuple[list[str], float]:
-    """What is wrong with the fractions at a value, and the square of the difference of one of two
-    in standard errors of its own, else 0."""
+    """Faults of the fractions at a value; and, where there are two, the square of the difference of
+    one of them from the engine's, in its standard errors, else 0."""
     met = np.flatnonzero(told.fractions[row])
     mine = {
         (told.attractors[k].split()[0], float(told.x1_min[row, k]), float(told.x1_max[row, k])): k
@@ -114,7 +114,7 @@ def differences(told: jb.BasinFractions, row: int, seen: Seen) -> tuple[list[str
 
 @functools.cache
 def told_by_package(seed: int, starts: int) -> jb.BasinFractions:
-    """The fractions at all values, from so many random starts."""
+    """The package's fractions at all values, from `starts` random starts."""
     return jb.basin_fractions(
         lambda nu0: jb.presets.class_b(nu0, NU1),
         span=SPAN,
@@ -134,7 +134,7 @@ def numbers(options) -> range:
 
 
 def outcome(options, number: int) -> Outcome:
-    """Compare at one value, with about so many starts of the engine."""
+    """Compares the fractions at one value, with about `options.runs` starts of the engine."""
     nu0 = float(np.linspace(*SPAN, VALUES)[number])
     seen = by_engine(nu0, options.runs, options.threads)
     total = sum(seen.counts)
@@ -166,7 +166,7 @@ def said(counts, largest) -> list[str]:
 
 
 def holds(counts) -> bool:
-    """Whether the values together are as chance gives them."""
+    """Whether chance explains the differences at all values together."""
     return _chance(counts) > CHANCE
 
 

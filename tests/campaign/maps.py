@@ -1,12 +1,12 @@
-"""Maps: what `region_map` draws of classes (c) and (d), and what it leaves out.
+"""Maps of `region_map` for classes (c) and (d): faults, and curves that are missing.
 
-Of each map are counted: neighbouring cells that have different motions with no curve within one
-cell; curves that bound nothing, that is, beside no row of which motions differ; ends of curves
-without a name; rows, and special points on the way, with a residual that is not small; and rows of
-which the mirror image is no point of the mirrored oscillator: x1 to -x1 exchanges (nu0, nu1) with
-(-nu1, -nu0) and (sigma0, sigma1) with (-sigma1, -sigma0), where both belts are alike. Special
-points of a map that is its own mirror image have theirs among them. And in cells drawn at random
-the engine has to have the equilibria and the cycles that the name of the region tells of.
+Faults of a map are: neighbouring cells with different motions but no curve within one cell; curves
+that bound nothing, because motions are the same on both sides of their rows; ends of curves without
+a name; rows and special points with a residual that is not small; and rows whose mirror image is no
+point of the mirrored oscillator: x1 to -x1 exchanges (nu0, nu1) with (-nu1, -nu0) and (sigma0,
+sigma1) with (-sigma1, -sigma0), where both belts are alike. In a map that is its own mirror image
+the mirror images of special points must be special points. In cells drawn at random the engine must
+find the equilibria and the cycles that the name of the region states.
 """
 
 import time
@@ -28,17 +28,17 @@ from jaxbelt.numerics.continuation import Stop
 from . import package, paths
 from .outcome import Outcome
 
-#: Cells along the axes: other numbers, lest cells lie where both parameters are the same.
+#: Numbers of cells along the axes, different so that no cell lies where both parameters are equal.
 CELLS = 64, 65
-#: Rows of a curve that are asked; so far from a row both its sides are, in units of the map's side.
+#: Number of rows checked on a curve; distance of both sides from a row, in units of the map's side.
 ROWS, BESIDE = 7, 2e-3
-#: Residuals of rows, and how far an image may be from a point that is refined there.
+#: Largest residual of a row; largest distance of a mirror image from the point refined there.
 SMALL, SAME = 1e-8, 1e-9
-#: The same of special points in which a curve ends, where it may be extrapolated.
+#: Largest residual of a special point at the end of a curve, which may be extrapolated.
 END = 1e-2
-#: Cells that the engine is asked about, and its starts in each.
+#: Number of cells checked with the engine, and of its starts in each.
 ASKED, STARTS = 150, 24
-#: How far from a row, at most, its image is looked for.
+#: Largest distance of the guesses from the mirror image of a row.
 ASIDE = 1e-4
 
 NU, SIGMA = (-0.7, 0.7), (-1.0, 1.0)
@@ -46,7 +46,7 @@ NU, SIGMA = (-0.7, 0.7), (-1.0, 1.0)
 
 @dataclass(frozen=True)
 class Plane:
-    """A map: (p, q) to the four numbers (nu0, nu1, sigma0, sigma1); its axes, (from, to) each."""
+    """A map. numbers: (p, q) to (nu0, nu1, sigma0, sigma1); axes: (from, to) by name."""
 
     name: str
     numbers: Callable
@@ -72,7 +72,7 @@ PLANES = (
 
 
 def differences(plane: Plane, told: jb.RegionMap) -> tuple[Counter, list[str]]:
-    """What a map leaves out, counted, and in words."""
+    """Counts of what was checked in a map, and its faults in words."""
     counts, wrong = Counter(curves=len(told.curves)), []
     counts["special points"] = sum(len(curve.special) for curve in told.curves)
     variation = varied_by_names(plane.make, told.names, told.values)
@@ -101,12 +101,12 @@ def differences(plane: Plane, told: jb.RegionMap) -> tuple[Counter, list[str]]:
 
 
 def in_one_unit(make: Callable[..., jb.Oscillator]) -> Callable[..., jb.Oscillator]:
-    """A function whose oscillators are in own units with one length for all, as `look_at` needs."""
+    """A function like `make` whose oscillators are in own units, all with the length 1."""
     return lambda **values: in_own_units(make(**values), 1.0)
 
 
 def _boundaries(plane: Plane, told: jb.RegionMap) -> np.ndarray:
-    """Pairs of neighbouring cells that differ, as `bounds.neighbours_that_differ` has them."""
+    """Pairs of neighbouring cells that differ, in the form of `bounds.neighbours_that_differ`."""
     grid = np.meshgrid(*told.values, indexing="ij")
     points = np.column_stack([axis.ravel() for axis in grid])
     found = motions_in_cells(in_one_unit(plane.make), told.names, points)
@@ -120,7 +120,7 @@ def _some_rows(curve: jb.BifurcationCurve) -> list[int]:
 
 
 def _bounds_something(plane: Plane, told: jb.RegionMap, curve: jb.BifurcationCurve) -> bool:
-    """Whether motions differ on the two sides of some of its rows."""
+    """Whether motions differ on the two sides of at least one of some rows of a curve."""
     if len(curve) < 3:
         return True
     sides = np.array([along[-1] - along[0] for along in told.values])
@@ -136,13 +136,13 @@ def _bounds_something(plane: Plane, told: jb.RegionMap, curve: jb.BifurcationCur
 
 
 def _not_mirrored(plane: Plane, curve: jb.BifurcationCurve, counts: Counter) -> list[str]:
-    """Rows of which the mirror image is no point of the mirrored oscillator."""
+    """Rows whose mirror image is no point of the mirrored oscillator, in words."""
     wrong = []
     for row in _some_rows(curve)[1::3]:
         condition = _for_mirror(curve.classes[row], curve.condition)
         chord = np.abs(curve.values[min(row + 1, len(curve) - 1)] - curve.values[max(row - 1, 0)])
         counts["mirrored"] += 1
-        # Along the other parameter, too: beside a belt at rest rounding may hide it along one.
+        # Along both parameters: beside a belt at rest rounding may hide the point along one.
         said = []
         for free in np.argsort(chord).tolist():
             said += _images(plane, condition, curve.values[row], free)
@@ -154,7 +154,7 @@ def _not_mirrored(plane: Plane, curve: jb.BifurcationCurve, counts: Counter) -> 
 
 
 def _not_solved(curve: jb.BifurcationCurve) -> list[str]:
-    """Special points that no solution of equations is."""
+    """Special points whose residual is too large to be a solution, in words."""
     order = curve.in_order()
     ends = order[0], order[-1]
     return [
@@ -165,7 +165,7 @@ def _not_solved(curve: jb.BifurcationCurve) -> list[str]:
 
 
 def _not_the_engines(plane: Plane, told: jb.RegionMap, counts: Counter) -> list[str]:
-    """Cells whose region has other equilibria or cycles than the engine sees there."""
+    """Cells whose region has other equilibria or cycles than the engine finds, in words."""
     rng, wrong = np.random.default_rng(len(told.curves)), []
     for cell in rng.integers(told.label.size, size=ASKED).tolist():
         place = np.unravel_index(cell, told.label.shape)
@@ -173,8 +173,8 @@ def _not_the_engines(plane: Plane, told: jb.RegionMap, counts: Counter) -> list[
         made = plane.make(**dict(zip(told.names, at, strict=True)))
         osc = package.engines(made)
         starts = np.column_stack([rng.uniform(-3, 3, STARTS), rng.uniform(-1.5, 1.5, STARTS)])
-        # On a cycle of the package the engine says whether it is there; from few starts it need not
-        # find it.
+        # The engine also starts on cycles of the package to confirm them, because from few starts
+        # it need not find them.
         known = [(float(one.x1_max), 0.0) for one in jb.portrait(made).cycles]
         seen = paths.label_of(osc, [*map(tuple, starts), *known])
         if not seen.decided or told.on_line[place]:
@@ -193,7 +193,7 @@ def as_label(seen: paths.Label) -> Label:
 
 
 def _without_image(plane: Plane, told: jb.RegionMap) -> list[str]:
-    """Special points of a map that is its own mirror image, of which the image is none of it."""
+    """Special points whose image is missing from a map that is its own mirror image, in words."""
     p, q = (axis[len(axis) // 3] for axis in told.values)
     numbers = plane.numbers(p, q)
     if numbers[2:] != (-numbers[3], -numbers[2]) or [*told.names] != ["nu0", "nu1"]:
@@ -211,7 +211,7 @@ def _without_image(plane: Plane, told: jb.RegionMap) -> list[str]:
 
 
 def _images(plane: Plane, condition, values: np.ndarray, free: int):
-    """What is found beside the mirror image of a row along a parameter, and how far from it."""
+    """Yields (distance, point): points refined beside the mirror image of a row, along p or q."""
     held, at = float(values[1 - free]), float(values[free])
 
     def make(value):
@@ -225,15 +225,15 @@ def _images(plane: Plane, condition, values: np.ndarray, free: int):
 
 
 def _aside(plane: Plane, p: float, q: float) -> float:
-    """How far from a row guesses are: no belt comes to rest, or to another one's velocity, on the
-    way there."""
+    """Distance of guesses from a row, so small that no belt comes to rest, or to the velocity of
+    the other belt, in between."""
     nu0, nu1, *_ = plane.numbers(p, q)
     gaps = np.abs([nu0, nu1, nu0 - nu1])
     return min(ASIDE, 0.5 * float(np.min(gaps, initial=np.inf, where=gaps > SAME)))
 
 
 def _for_mirror(kind: type, condition):
-    """The condition of a row on the mirror image, where belts have changed places."""
+    """The condition of a row for the mirror image, in which belts are exchanged."""
     names = [name for name in ("belt", "belts") if hasattr(condition, name)]
     belts = tuple(1 - belt for belt in condition.belts_concerned)
     return kind(belts[0] if names == ["belt"] else belts) if names else kind()

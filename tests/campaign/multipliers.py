@@ -1,9 +1,9 @@
 """Multipliers of periodic forced motions, stable and unstable, against differences of the engine.
 
-Through random and round oscillators motions are sought by `find_cycle` from the case's start, and
-by `periodic` from guesses around what a run comes to. The engine starts at the state of each, has
-to come back to it after its periods, and sum and product of its multipliers have to be those of the
-eigenvalues of differences of the engine's runs.
+Motions of random and round oscillators are found by `find_cycle` from the case's start, and by
+`periodic` from guesses around the end of a long run. The engine starts at the state of each motion
+and has to return to it after the motion's periods; sum and product of the multipliers have to be
+those of the eigenvalues of a matrix of differences of the engine's runs.
 """
 
 import numpy as np
@@ -13,16 +13,16 @@ import jaxbelt as jb
 from . import forced, forced_cases, forced_package
 from .outcome import Outcome
 
-#: Structures, each a compilation.
+#: Number of structures, each a compilation.
 PROGRAMS = 10
-#: Guesses of one oscillator, and the largest number of periods of its motions.
+#: Number of guesses for one oscillator, and the largest number of periods of its motions.
 GUESSES, MOST_PERIODS = 24, 2
-#: A motion comes back up to this, times how much it grows.
+#: Largest error of the return to a start, times the largest multiplier where that is > 1.
 SAME = 1e-8
-#: Steps of the differences. Where two of them give the same to this a multiplier is known, up to
-#: so many times their difference, and this.
+#: Steps of the differences. KNOWN: the multipliers are known if the results of both steps differ by
+#: less. The tolerance is TIMES their difference, plus ROUNDING.
 STEPS, KNOWN, TIMES, ROUNDING = (1e-4, 3e-5), 1e-4, 30, 1e-7
-#: Motions of one oscillator whose states differ by less are one.
+#: Motions of one oscillator are the same if their states differ by less.
 ONE_MOTION = 1e-5
 
 
@@ -89,7 +89,7 @@ def _compared(osc, motion, period):
         values = np.linalg.eigvals(forced_cases.monodromy(osc, start, n, period, h))
         known.append(values[np.argsort(np.abs(values))])
     row["known"] = [one.tolist() for one in known]
-    # By what does not depend on their order: sum and product.
+    # Sum and product do not depend on the order of multipliers.
     sums = [np.array([np.sum(one).real, np.prod(one).real]) for one in (*known, told)]
     doubt, off = np.abs(sums[0] - sums[1]), np.abs(sums[1] - sums[2])
     size = 1 + np.abs(sums[1])

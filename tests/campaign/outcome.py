@@ -1,12 +1,12 @@
-"""What a case of a campaign gave: what does not agree, and numbers that are summed up.
+"""The outcome of a case of a campaign: disagreements, and numbers to sum over cases.
 
-A campaign is a module with `outcome(options, number)`, one case, compared; and, where it is not
-what it is in `USUAL`, with
+A campaign is a module with `outcome(options, number)`, which runs and compares one case, and, where
+they differ from those in `USUAL`, with
 
-- `settings(options)`: what decides its cases, beside their numbers and the seed;
+- `settings(options)`: options on which its cases depend, besides their numbers and the seed;
 - `numbers(options)`: the numbers of its cases;
-- `said(counts, largest)`: how all of them are summed up, in lines;
-- `holds(counts)`: whether that is right.
+- `said(counts, largest)`: lines that sum up all cases;
+- `holds(counts)`: whether the counts of all cases are right.
 """
 
 from collections import Counter
@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 
 @dataclass
 class Outcome:
-    """line: the case in a few words. wrong: what does not agree. notes: what is to be looked into.
-    counts are added up over the cases, and of `largest` the largest values are kept."""
+    """line: the case in a few words. wrong: disagreements. notes: what a person should look at.
+    counts: added up over the cases. largest: the largest value over the cases is kept."""
 
     line: str = ""
     wrong: list[str] = field(default_factory=list)
@@ -28,7 +28,7 @@ class Outcome:
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
 
-#: What of a campaign need not be written.
+#: Functions of a campaign that does not define its own.
 USUAL = {
     "settings": lambda options: {},
     "numbers": lambda options: range(options.runs),
@@ -40,7 +40,7 @@ USUAL = {
 
 
 def part(campaign, name):
-    """A function of a campaign by its name."""
+    """The function of a campaign with this name, or the one in `USUAL`."""
     return getattr(campaign, name, USUAL.get(name))
 
 

@@ -1,8 +1,8 @@
 """The package on cases: final states and labels by `sweep`, trajectories by vmapped `simulate`.
 
 Cases of one structure (laws, edges or none) are one batch of one compiled program: every number of
-the oscillator and of the start varies from lane to lane. The package is given each in the units of
-its case, and what it answers is brought back; those of one call share them.
+the oscillator and of the start varies from lane to lane. The package gets each case in the units of
+the case, and its answers are converted back; all cases of one call share their units.
 """
 
 import functools
@@ -22,9 +22,8 @@ from jaxbelt.sweeps import question
 from . import engine
 
 
-#: The module, whose name in the package is that of its function.
 class Peak(jb.AbstractFriction):
-    """mu(r) = kinetic + (static - kinetic) exp(-(r/velocity)^2) + viscous r, a law of one's own."""
+    """mu(r) = kinetic + (static - kinetic) exp(-(r/velocity)^2) + viscous r, a user's own law."""
 
     static: jax.Array
     kinetic: jax.Array
@@ -55,7 +54,7 @@ _KINDS = ("equilibrium", "cycle", "stuck")
 
 
 def oscillator(osc):
-    """The same oscillator as the package's."""
+    """The engine's oscillator as one of the package."""
     belts = tuple(
         jb.Belt(b.velocity, _LAWS[b.law[0]](*b.law[1:]), b.load, b.lower, b.upper)
         for b in osc.belts
@@ -64,7 +63,7 @@ def oscillator(osc):
 
 
 def engines(osc):
-    """An oscillator of the package's, whose laws are Conti's, as the engine's."""
+    """An oscillator of the package with Conti's laws, as one of the engine."""
     names = ("static", "residual", "steepness", "quadratic")
     belts = []
     for b in osc.belts:
@@ -95,7 +94,7 @@ def as_code(case):
 
 
 def numbers(case):
-    """All numbers of a case in the order that `_from_numbers` takes them in."""
+    """All numbers of a case in the order that `_from_numbers` expects."""
     (osc, _), (laws, edges) = case.given, case.structure
     row = [osc.damping, osc.omega]
     for b, law in zip(osc.belts, laws):
@@ -134,8 +133,8 @@ def _from_numbers(structure, row):
 
 
 def _leaves(structure, table, moves=None):
-    """Rows of numbers in the order of the leaves of the oscillators that the kernel takes; with
-    `moves`, their derivatives along these."""
+    """Leaves [cases, leaves] of the oscillators that the kernel takes, from rows of numbers; with
+    `moves`, the derivatives of the leaves along these."""
 
     def leaves(row):
         osc = in_units_of_run(_from_numbers(structure, row))
@@ -150,8 +149,8 @@ def _leaves(structure, table, moves=None):
 def swept(cases, observe, directions=None, **options):
     """The variables of `jb.sweep` over cases of one structure and one T.
 
-    The sweep's own axes vary the start of all runs or of none; here every case has its own.
-    directions: to differentiate along, one a case; the derivatives are those by "case".
+    Axes of a sweep cannot give every run its own start; here a patched grid does. directions: one
+    for each case; the derivatives along them are those by "case".
     """
     structure = cases[0].structure
     table = np.array([numbers(case) for case in cases])
@@ -179,7 +178,7 @@ def swept(cases, observe, directions=None, **options):
 
 @dataclass(frozen=True)
 class Final:
-    """How a run ended; events: (t, kind, belt, x1, x2) each, where they are known."""
+    """How a run ended; events: (t, kind, belt, x1, x2) each, or None if not recorded."""
 
     x1: float
     x2: float
@@ -259,7 +258,7 @@ def cycles(cases):
 
 
 def _loop(word):
-    """A signature's word as events, (kind, belt) each; None where it was too long."""
+    """Events (kind, belt) of a signature in words; None if it was too long."""
     if word in ("none", "smooth"):
         return ()
     if word == "long":
@@ -295,12 +294,12 @@ def _trajectories(structure, T, tol, max_segments):
     return jax.jit(jax.vmap(one, in_axes=(0, 0, None)))
 
 
-#: Arcs that runs are given which used up what `simulate` gives them by itself.
+#: max_segments of runs for which the default of `simulate` was too small.
 MANY_SEGMENTS = 32768
 
 
 def simulated(cases, tol):
-    """Trajectories by `simulate`; where its budget was too small, with a larger one, as it says."""
+    """Trajectories by `simulate`; with MANY_SEGMENTS where the default was too small."""
     found = _simulated(cases, tol, None)
     short = [i for i, one in enumerate(found) if one.status == jb.Status.TOO_MANY_SEGMENTS]
     for i, one in zip(short, _simulated([cases[i] for i in short], tol, MANY_SEGMENTS)):
@@ -309,7 +308,7 @@ def simulated(cases, tol):
 
 
 def _simulated(cases, tol, max_segments):
-    """Vmapped over cases of one structure and one T."""
+    """Trajectories by `simulate`, vmapped over cases of one structure and one T."""
     if not cases:
         return []
     run = _trajectories(cases[0].structure, cases[0].T, tol, max_segments)
@@ -359,7 +358,7 @@ def _pushed(structure, T, tol):
 
 
 def derivatives(cases, directions, tol, by):
-    """d(x1, x2 at T) along a direction a case, by "simulate" or by the "sweep"."""
+    """d(x1, x2 at T) along one direction for each case; by: "simulate" or "sweep"."""
     length = cases[0].units.length
     if by == "sweep":
         found = swept(cases, "final", directions, t1=cases[0].T, rtol=tol, atol=tol * length)
@@ -391,7 +390,7 @@ def _pushed_cycle(structure):
 
 
 def period_derivatives(cases, directions):
-    """d(period) of the cycle that each start leads to, along a direction a case."""
+    """d(period) of the cycle that each start leads to, along one direction for each case."""
     out = []
     for case, direction in zip(cases, directions):
         row = jnp.array(numbers(case))

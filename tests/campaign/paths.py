@@ -1,15 +1,15 @@
-"""Paths in one parameter: what `scan` finds against what the engine sees by brute force.
+"""Paths in one parameter: what `scan` finds against what the engine finds by brute force.
 
 A path is an oscillator, one of its parameters and an interval. On a grid along it the engine runs
-from many starts, and from every attractor that it knows at the value beside, so that one with a
-small basin is not lost. Its label is the equilibria, in closed form and written down here once
-more, and the cycles: the modes of one loop, and where they are. Three things must hold.
+from many starts, and from every attractor that it found at the neighbouring values, so that one
+with a small basin is not lost. The engine's label has the equilibria, in a closed form independent
+of the package, and the cycles: the modes of one loop, and their place. Three things must hold.
 
-- Every cycle of the engine is among those of the label that `scan` goes by, and the other way
-  round, where the engine starts on the cycle that `scan` has.
-- Where the engine's labels differ, by bisection to a small part of the interval, there is a point.
-- On the two sides of a point the engine's labels differ; of a connection of saddles, the ways that
-  the engine's runs take from it.
+- Every cycle of the engine is in the label that `scan` uses, and every cycle of that label exists
+  for the engine when it starts on it.
+- Between values with different labels, narrowed to a small part of the interval, is a point.
+- On the two sides of a point the engine's labels differ; at a connection of saddles the engine's
+  runs from the saddle part there.
 """
 
 import functools
@@ -32,30 +32,30 @@ from .cases import random_case, rational_case, structures
 from .outcome import Outcome
 from .units import ENGINES, Units, drawn
 
-#: Programs, one for each combination of laws, that a campaign compiles.
+#: Number of structures (laws and edges) of a campaign, each a compilation.
 PROGRAMS = 6
-#: Of so many random paths the first is taken along which something happens by a few runs, at so
-#: many values, if there is one.
+#: Of DRAWS random paths the first one is taken along which labels change by a few runs at COARSE
+#: values; the last one if there is none.
 DRAWS, COARSE = 8, 6
 #: Values on the grid, and starts at each.
 GRID, STARTS = 48, 12
 #: Changes are narrowed to this fraction of the interval.
 NARROW = 1e-4
-#: Extrema and periods of one cycle differ by less: the engine's repeat to 2e-11, and what slowly
-#: approaches a limit may be a thousand times as far from it.
+#: Largest difference of extrema and periods of the same cycle: the engine's repeat to 2e-11, and a
+#: run that approaches slowly may be a thousand times as far from its limit.
 SAME = 1e-6
-#: Events at places that differ by less, relative to their size, happen at once: either may come
-#: first, by rounding.
+#: Relative distance below which two events happen at one place: rounding decides which one comes
+#: first.
 ONE_PLACE = 1e-14
-#: Edges, and rests beside them, that differ by less are one.
+#: Distance below which two edges, or an edge and an equilibrium, coincide.
 ONE_EDGE = 1e-12
-#: Smaller cycles than this one around a pseudo-focus are not told from it.
+#: Width below which a cycle around a pseudo-focus cannot be distinguished from it.
 TINY = 1e-3
-#: Events at the end of a run that passes too many, some loops.
+#: Number of the last events, some loops, that are examined in a run with too many events.
 LAST_EVENTS = 100
-#: Time after which orbits that part at a saddle are looked at.
+#: Time after the end of a connection at which orbits that part there are compared.
 PARTED = 1.0
-#: Time until the engine gives a run up.
+#: Longest time of a run of the engine; its attractor is then undecided.
 PATIENCE = 3000.0
 
 NUMBERS = {
@@ -67,8 +67,8 @@ NUMBERS = {
 
 @dataclass(frozen=True)
 class Case:
-    """The engine's oscillator, the parameter as (belt or -1, name), and the interval; and units in
-    which the package is asked."""
+    """The engine's oscillator, the parameter as (belt or -1, name), the interval, and the units in
+    which the package gets them."""
 
     oscillator: engine.Oscillator
     parameter: tuple[int, str]
@@ -77,21 +77,21 @@ class Case:
     units: Units = ENGINES
 
     def at(self, value: float) -> engine.Oscillator:
-        """The engine's oscillator there."""
+        """The engine's oscillator at a value of the parameter."""
         return with_value(self.oscillator, self.parameter, value)
 
     def given(self, value: float) -> jb.Oscillator:
-        """The oscillator there as the package is given it."""
+        """The package's oscillator at a value of the parameter, in the units of the case."""
         return package.oscillator(self.units.given(self.at(value)))
 
     @property
     def measured(self) -> float:
-        """How many of the user's units one of the parameter is."""
+        """Size of 1 of the parameter in the units of the case."""
         return self.units.of(self.oscillator, self.parameter)
 
     @property
     def given_span(self) -> tuple[float, float]:
-        """The interval as the package is given it."""
+        """The interval in the units of the case."""
         first, last = (end * self.measured for end in self.span)
         return first, last
 
@@ -103,7 +103,7 @@ class Case:
 
 @functools.cache
 def selector(parameter: tuple[int, str]):
-    """One function a parameter, so that what is compiled for it serves all paths."""
+    """The same function for the same parameter, so that compiled programs serve all paths."""
     number, name = parameter
 
     def where(osc):
@@ -187,7 +187,7 @@ def is_possible(osc: engine.Oscillator) -> bool:
     return osc.damping >= 0 and all(b.lower < b.upper for b in osc.belts)
 
 
-# --- what the engine sees -------------------------------------------------------------------------
+# --- labels by the engine -------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -216,12 +216,12 @@ class Label:
 
     @property
     def name(self):
-        """What is compared between one value and another."""
+        """The part of a label that is compared between values."""
         return self.rests, tuple(sorted(cycle.modes for cycle in self.cycles))
 
 
 def label_of(osc: engine.Oscillator, starts) -> Label:
-    """The label by runs from these starts."""
+    """The engine's label, by runs from these starts."""
     label = Label(equilibria(osc), [], True)
     for start in starts:
         if _circles_an_edge(osc, start, label.rests):
@@ -230,8 +230,8 @@ def label_of(osc: engine.Oscillator, starts) -> Label:
         label.decided &= found.kind != "undecided"
         if found.kind == "cycle":
             cycle = _cycle(osc, found)
-            # Loops around a pseudo-focus seem to repeat long before they have shrunk to it; but not
-            # those that stick, which are the same after one.
+            # Slipping loops around a pseudo-focus seem to repeat long before they shrink to it;
+            # loops that stick do not, because they repeat exactly after one.
             slips = not any(0 in modes for modes in cycle.modes)
             around = any(kind == 3 for kind, _, _ in label.rests)
             if slips and around and found.x1[1] - found.x1[0] < TINY:
@@ -243,7 +243,7 @@ def label_of(osc: engine.Oscillator, starts) -> Label:
 
 
 def _circles_an_edge(osc: engine.Oscillator, start, rests) -> bool:
-    """Whether a run passes an edge ever faster around a pseudo-focus that attracts."""
+    """Whether a run converges to an attracting pseudo-focus, passing its edge ever faster."""
     if not any(kind == 3 and stable for kind, stable, _ in rests):
         return False
     run = engine.simulate(osc, start, 400.0, max_events=8000)
@@ -257,7 +257,7 @@ def _circles_an_edge(osc: engine.Oscillator, start, rests) -> bool:
 def _cycle(osc: engine.Oscillator, found: engine.Attractor) -> Cycle:
     top = (found.x1[1], 0.0)
     run = engine.simulate(osc, top, 2.3 * found.period)
-    # Not the first moments: a belt at rest may be crossed at the top.
+    # Events are taken from later on, because a belt at rest may be crossed at the top.
     inside = (
         (run.t > 0.3 * found.period) & (run.t <= 1.3 * found.period) & (run.kind <= engine.EDGE)
     )
@@ -267,8 +267,8 @@ def _cycle(osc: engine.Oscillator, found: engine.Attractor) -> Cycle:
 
 
 def _lasts(run) -> np.ndarray:
-    """Whether the mode after each event lasts: one that the next event, at one place but for
-    rounding, ends at once is none, as where slip onset lies on an edge."""
+    """Whether the mode after each event of a run lasts, [events]: False if the next event is at the
+    same place up to rounding, as where slip onset lies on an edge."""
     events = np.flatnonzero(run.kind <= engine.EDGE)
     lasts = np.ones(len(run.t), bool)
     here, ahead = run.y[events[:-1]], run.y[events[1:]]
@@ -282,15 +282,15 @@ def _told(osc: engine.Oscillator, codes) -> tuple:
 
 
 def _loop(modes) -> tuple:
-    """Modes one after another without repetition, from the least of their orders on."""
+    """Successive modes without repetition, rotated to the smallest sequence."""
     before = [modes[-1], *modes[:-1]]
     kept = [mode for mode, last in zip(modes, before, strict=True) if mode != last] or modes[:1]
     return min(tuple(kept[i:] + kept[:i]) for i in range(len(kept)))
 
 
 def equilibria(osc: engine.Oscillator) -> tuple:
-    """Where the mass can rest, (kind, stable, contact codes): 1 a fixed point, 2 a segment, 3 a
-    pseudo-focus; from left to right."""
+    """Equilibria (kind, stable, contact codes) from left to right; kind: 1 fixed point, 2 segment,
+    3 pseudo-focus."""
     table = osc.table()
     ends = []
     for x in sorted(x for b in osc.belts for x in (b.lower, b.upper) if isfinite(x)):
@@ -301,8 +301,8 @@ def equilibria(osc: engine.Oscillator) -> tuple:
     held_at = [end for zone in zones for end in _segment(osc, table, zone)]
     found: list = []
     for row in filter(None, rows):
-        # A fixed point on an edge to which a segment reaches is the end of that; and one that lies
-        # there for either side is one.
+        # A fixed point on an edge that a segment reaches is the end of the segment; a fixed point
+        # on an edge that both zones have counts once.
         others = [*held_at, *(other[0] for other in found if other[1] == 1)]
         if row[1] == 1 and any(abs(row[0] - x) < ONE_EDGE for x in others):
             continue
@@ -318,7 +318,7 @@ def equilibria(osc: engine.Oscillator) -> tuple:
 
 
 def _leaves_edge(osc, table, x1, zones) -> bool:
-    """Whether a fixed point lies on an edge and the other side pushes away from it."""
+    """Whether a fixed point is on an edge, and the field of one side pushes away from the edge."""
     for left, right in pairwise(zones):
         if abs(x1 - left[1]) < ONE_EDGE:
             pulls = [_side(osc, table, zone)[1] - x1 for zone in (left, right)]
@@ -328,7 +328,7 @@ def _leaves_edge(osc, table, x1, zones) -> bool:
 
 
 def _side(osc, table, zone):
-    """At rest in a zone: contact codes, the pull, what belts at rest hold and rub with, trace."""
+    """At x2 = 0 in a zone: codes, pull of moving belts, static, kinetic force at rest, trace."""
     codes, pull, held, rubs, trace = [], 0.0, 0.0, 0.0, -osc.damping
     for row, belt in zip(table, osc.belts, strict=True):
         if zone[0] < belt.lower - ONE_EDGE or zone[1] > belt.upper + ONE_EDGE:
@@ -347,7 +347,7 @@ def _side(osc, table, zone):
 
 
 def _segment(osc, table, zone):
-    """The ends of the segment on which belts at rest hold the mass in a zone; (): there is none."""
+    """Ends of the segment of a zone where belts at rest hold the mass; () if there is none."""
     _, pull, held, *_ = _side(osc, table, zone)
     first, last = max(pull - held, zone[0]), min(pull + held, zone[1])
     return (first, last) if last - first > ONE_EDGE else ()
@@ -356,7 +356,7 @@ def _segment(osc, table, zone):
 def _rest_in_zone(osc, table, lower, upper):
     codes, pull, held, rubs, trace = _side(osc, table, (lower, upper))
     if held == 0:
-        # A belt at rest that can hold nothing slips.
+        # Belts at rest without static friction slip.
         codes = [1 if code == 0 else code for code in codes]
         is_here = lower - ONE_EDGE < pull < upper + ONE_EDGE
         return (pull, 1, trace < 0, tuple(codes)) if is_here else None
@@ -368,8 +368,8 @@ def _rest_in_zone(osc, table, lower, upper):
 
 
 def _returns(osc, first, last):
-    """Whether runs from beside an end of a segment, up and down, end in it again, not far away: a
-    large motion may lead back by chance."""
+    """Whether runs from beside an end of a segment, up and down, end in the segment near there; far
+    away does not count, because a large motion may lead back by chance."""
     near = 1e-3 * (last - first)
     for x1 in (first + near, last - near):
         begin, end = max(first, x1 - 10 * near), min(last, x1 + 10 * near)
@@ -384,7 +384,7 @@ def _rest_on_edge(osc, table, edge, left, right):
     (a, b), capacity = (pull - edge, other[1] - edge), max(held, other[2])
     if not a > held + ONE_EDGE or not -b > other[2] + ONE_EDGE:
         return None
-    # Which way belts rub there makes no difference.
+    # The signs of slipping belts there make no difference.
     signs = [code if abs(code) == 2 else 1 for code in codes]
     stable = True if capacity + rubs + other[3] > 0 else trace / a + other[4] / -b < 0
     return edge, 3, stable, tuple(signs)
@@ -395,7 +395,7 @@ def _rest_on_edge(osc, table, edge, left, right):
 
 @dataclass
 class Report:
-    """What does not agree, a line each; and how much was compared."""
+    """Disagreements, a line each; and numbers of what was compared."""
 
     case: Case
     points: tuple
@@ -407,7 +407,7 @@ class Report:
 
 
 class Brute:
-    """The engine's labels along a path; each value knows the cycles of the ones beside it."""
+    """The engine's labels along a path; runs also start on cycles of neighbouring values."""
 
     def __init__(self, case: Case, rng: np.random.Generator):
         self.case = case
@@ -428,7 +428,7 @@ class Brute:
         return [self.labels[known[i]] for i in (at - 1, at) if 0 <= i < len(known)]
 
     def learn(self, value: float, start) -> Cycle | None:
-        """The cycle that a start leads to, which is known from then on."""
+        """The cycle that a start leads to, which is added to the label of the value; or None."""
         found = label_of(self.case.at(value), [start])
         if not found.cycles:
             return None
@@ -438,7 +438,7 @@ class Brute:
         return cycle
 
     def spread(self) -> None:
-        """Let values know cycles of the ones beside them."""
+        """Follows cycles from each value to the neighbouring ones, and adds what they lead to."""
         values = sorted(self.labels)
         for pairs in (pairwise(values), pairwise(values[::-1])):
             for known, value in pairs:
@@ -447,7 +447,7 @@ class Brute:
                         self.learn(value, cycle.state)
 
     def changes(self, a: float, b: float) -> Iterator[tuple[float, float]]:
-        """Where labels differ between two values, narrowed."""
+        """Intervals, narrowed by bisection, between whose ends labels differ."""
         left, right = self.labels[a], self.labels[b]
         if not (left.decided and right.decided) or left.name == right.name:
             return
@@ -470,7 +470,7 @@ class Brute:
         yield from self.changes(middle, b)
 
     def _is_decided(self, known: float, value: float) -> bool:
-        """Whether the cycles that a value lacks are not there; they may be too small to be seen."""
+        """Whether runs show that `value` lacks cycles of `known`; these may be too small for it."""
         names = [cycle.modes for cycle in self.labels[value].cycles]
         missing = [cycle for cycle in self.labels[known].cycles if cycle.modes not in names]
         osc = self.case.at(value)
@@ -478,7 +478,7 @@ class Brute:
 
 
 class OwnPath:
-    """The path of `scan`, which is in own units, as of the engine's."""
+    """The path of `scan`, which is in its own units, with values and states in the engine's."""
 
     def __init__(self, case: Case):
         middle = case.given(0.5 * sum(case.span))
@@ -498,7 +498,7 @@ class OwnPath:
         return self.path.label(self._own(value))
 
     def cycles(self, value: float) -> list[tuple]:
-        """Of each cycle its modes, its place and the state with the largest x1."""
+        """For each cycle its modes, its place and the state with the largest x1."""
         found = []
         for one in self.path.cycles[self._own(value)]:
             if one.path:
@@ -515,7 +515,7 @@ class OwnPath:
 
 
 def check(case: Case, seed: int) -> Report:
-    """Compare along one path."""
+    """Compares along one path."""
     rng = np.random.default_rng(seed)
     begun = time.perf_counter()
     first, last = case.span
@@ -524,7 +524,7 @@ def check(case: Case, seed: int) -> Report:
     report = Report(case, points, [])
     at_scan = time.perf_counter() - begun
     length = last - first
-    # No round numbers.
+    # The values are not round numbers.
     values = (first + length * (np.arange(GRID) + 0.3779) / GRID).tolist()
     special = [float(point.value) for point in points]
     brute = Brute(case, rng)
@@ -538,8 +538,8 @@ def check(case: Case, seed: int) -> Report:
     for a, b in pairwise(values):
         for low, high in brute.changes(a, b):
             if not any(low - tolerance <= at <= high + tolerance for at in special):
-                # The basin of a cycle about to vanish may be missed: with a start on that of
-                # `scan` the engine says whether it is there.
+                # Starts may miss the basin of a cycle about to vanish: a start on the cycle of
+                # `scan` shows whether it exists.
                 path.find_labels([low, high])
                 for value in (low, high):
                     for start in _starts_on_cycles(path, value):
@@ -558,7 +558,7 @@ def check(case: Case, seed: int) -> Report:
 
 
 def _compare(path: OwnPath, brute: Brute, value: float, report: Report) -> None:
-    """The label of `scan` and that of the engine at one value."""
+    """Compares the label of `scan` with the engine's at one value."""
     label, ours = brute.labels[value], path.label(value)
     if not label.decided:
         return
@@ -578,10 +578,10 @@ def _compare(path: OwnPath, brute: Brute, value: float, report: Report) -> None:
 
 
 def _both_sides(path: OwnPath, point, special, brute: Brute, report: Report) -> None:
-    """Whether something changes at a point of `scan`.
+    """Checks that labels differ on the two sides of a point of `scan`.
 
-    The engine starts on the cycles of `scan`, too: it says whether they are there, but from a few
-    starts it need not find them.
+    The engine also starts on the cycles of `scan` to confirm them, because from few starts it need
+    not find them.
     """
     at, (first, last) = float(point.value), brute.case.span
     others = [abs(at - other) for other in special if other != at]
@@ -601,8 +601,8 @@ def _both_sides(path: OwnPath, point, special, brute: Brute, report: Report) -> 
             if all(cycle.modes != one.modes for one in other.cycles):
                 brute.learn(value, cycle.state)
     if sides[0].name == sides[1].name:
-        # One that hardly attracts, beside a fold, is reached by no run in time; from a start on it
-        # the engine says whether it is there.
+        # Near a fold no run reaches a cycle that hardly attracts in time; a start on the cycle
+        # shows whether it exists.
         for value in (at - away, at + away):
             for cycle in jb.portrait(brute.case.given(value)).cycles:
                 brute.learn(value, (float(cycle.x1_max) / brute.case.units.length, 0.0))
@@ -611,8 +611,8 @@ def _both_sides(path: OwnPath, point, special, brute: Brute, report: Report) -> 
 
 
 def _part(case: Case, orbit: np.ndarray, period: float, at: float, away: float) -> bool:
-    """Whether the engine's runs from the saddle, on the two sides of a connection, part where that
-    ends: they go two ways from there, in a time that is not small."""
+    """Whether the engine's runs from the saddle, at values on the two sides of a connection, are
+    apart a time PARTED after its end."""
     upward = np.sign(orbit[1, 1])
     beyond = []
     for value in (at - away, at + away):
@@ -625,12 +625,12 @@ def _part(case: Case, orbit: np.ndarray, period: float, at: float, away: float) 
 
 
 def _starts_on_cycles(path: OwnPath, value: float) -> list[tuple[float, float]]:
-    """A state on each of the cycles that `scan` has there."""
+    """A state on each cycle of `scan` at a value."""
     return [start for *_, start in path.cycles(value)]
 
 
 def _start_on(loop, length: float) -> tuple[float, float]:
-    """The state of a loop with the largest x1, lengths times that."""
+    """The state of a loop with the largest x1, times `length`."""
     rows = np.asarray(loop.entries)[np.asarray(loop.used)]
     x1, x2 = (rows[int(np.argmax(rows[:, 0]))] * length).tolist()
     return x1, x2
@@ -642,7 +642,7 @@ def words(label: Label) -> str:
 
 
 def case_of(seed: int, number: int) -> Case:
-    """The path of that number; every other one is rational."""
+    """The path of a case number; every other one is rational."""
     kinds = structures(np.random.default_rng(seed), PROGRAMS)
     rng = np.random.default_rng((seed, number))
     for _ in range(DRAWS):
@@ -653,7 +653,7 @@ def case_of(seed: int, number: int) -> Case:
 
 
 def _changes(case: Case) -> bool:
-    """Whether something happens along a path, by a few runs."""
+    """Whether labels change along a path, by a few runs."""
     values = np.linspace(*case.span, COARSE + 2)[1:-1] + 1e-3 * (case.span[1] - case.span[0])
     names = set()
     for value in values.tolist():
@@ -662,7 +662,7 @@ def _changes(case: Case) -> bool:
 
 
 def outcome(options, number: int) -> Outcome:
-    """Compare along one path."""
+    """Compares along one path."""
     case = case_of(options.seed, number)
     report = check(case, options.seed + number)
     unexplained = [float(p.value) for p in report.points if p.kind == "Unexplained"]

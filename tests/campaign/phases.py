@@ -1,8 +1,8 @@
 """Where t is 0 makes no difference: `bifurcation_diagram` of one oscillator at several phases.
 
-As in `branches` a branch is followed through a random or round oscillator with one force. At
-another phase of the force it is the same oscillator, seen from another time: its diagram has to
-have the same points, with the same multipliers, as many branches, and as many open ends.
+As in `branches`, a branch of a random or round oscillator with one force is followed. At another
+phase of the force it is the same oscillator with time shifted: its diagram must have the same
+points, with the same multipliers, as many branches, and as many open ends.
 """
 
 from dataclasses import replace
@@ -14,10 +14,10 @@ import jaxbelt as jb
 from . import branches, forced_cases, forced_package
 from .outcome import Outcome
 
-#: Points are at one value if they differ by less, over the span; multipliers by less, over 1 and
+#: Largest difference of the values of a point, over the span, and of its multipliers, over 1 plus
 #: their size.
 SAME_VALUE, SAME_MULTIPLIER = 1e-7, 1e-3
-#: Shifts of the phase beside a random one.
+#: Shifts of the phase, one of which is used besides a random one.
 ROUND = (np.pi / 2, np.pi, 2.0)
 
 

@@ -1,13 +1,12 @@
-"""Portraits: all that `portrait` tells of an oscillator against what the engine sees.
+"""Portraits: the result of `portrait` for an oscillator against runs of the engine.
 
 The engine runs from 121 starts on a grid. Three things must hold.
 
-- Where each run leads is an attractor of the portrait. One of the portrait that no start leads to
-  is one for the engine that starts on it; it is set aside and counted, for its basin is small.
-- Two neighbours on the grid that lead to different attractors are parted by an unstable cycle or a
-  stable separatrix, which passes between them; or by a boundary, where the static limit of its belt
-  exceeds mu(0).
-- Starts beside an unstable cycle, within it and without, leave it.
+- Each run leads to an attractor of the portrait. If no start leads to an attractor of the portrait,
+  a run that starts on it must stay; it is set aside and counted, because its basin is small.
+- Between two neighbours on the grid that lead to different attractors passes an unstable cycle or a
+  stable separatrix; or a boundary, where the static limit of its belt exceeds mu(0).
+- Runs that start beside an unstable cycle, inside and outside, leave it.
 """
 
 import time
@@ -24,29 +23,29 @@ from . import engine, package, units
 from .cases import PAPER, random_case, rational_case, special_positions, structures
 from .outcome import Outcome
 
-#: Starts: so many displacements and velocities, in this window.
+#: Number of displacements and of velocities of the starts, and their window.
 SIDE, WINDOW = 11, ((-3.0, 3.0), (-2.0, 2.0))
-#: Extrema and periods of one cycle, and places at rest, differ by less.
+#: Largest difference of extrema and periods of one cycle, and of places of one equilibrium.
 SAME, AT_REST = 1e-6, 1e-4
-#: Samples are connected by chords: these are no farther from the curve, as a part of the distance
-#: between starts.
+#: Largest distance of a curve from the chords between its samples, over the distance between
+#: starts.
 CHORD = 0.02
-#: Smaller cycles than the first, at a pseudo-focus than the second, are not told from rest.
+#: Width below which a cycle, and one at a pseudo-focus, cannot be distinguished from rest.
 TINY, TINY_AT_FOCUS = 1e-5, 1e-7
-#: A fixed point and a saddle as near to each other are one.
+#: Distance below which a fixed point and a saddle coincide.
 AT_ROUNDING = 1e-12
-#: Multipliers are those of differences to this, but of steeper maps and smaller cycles.
+#: Largest error of a multiplier; steeper maps than STEEP and smaller cycles are not compared.
 SLOPE, STEEP, SMALL = 1e-2, 100.0, 1e-2
-#: At a top x2 is zero, up to rounding.
+#: Largest |x2| at a maximum of x1, by rounding.
 AT_TOP = 1e-9
-#: Round numbers meet Hopf points: there loops neither grow nor shrink, to any order that shows.
+#: Rate below which an equilibrium is a Hopf point, which round numbers hit: loops stay there.
 CENTRE = 1e-12
-#: Time until the engine gives a run up.
+#: Longest time of a run of the engine; its attractor is then undecided.
 PATIENCE = 20_000.0
 
 
 def random_oscillator(rng: np.random.Generator) -> tuple[str, engine.Oscillator]:
-    """A kind, and an oscillator of it."""
+    """A kind of oscillator, and a random oscillator of this kind."""
     kind = str(rng.choice(KINDS, p=SHARES))
     if kind == "paper":
         return kind, _of_the_paper(rng)
@@ -103,13 +102,13 @@ def _with_edge_on_equilibrium(rng, osc: engine.Oscillator) -> engine.Oscillator:
     return replace(osc, belts=(first, *(replace(b, lower=edge, upper=inf) for b in rest)))
 
 
-# --- what is compared -----------------------------------------------------------------------------
+# --- comparison -----------------------------------------------------------------------------------
 
 
 def differences(osc: engine.Oscillator, told: jb.Portrait) -> tuple[list[str], Counter]:
-    """What is wrong with the portrait of an oscillator, and how often what was set aside.
+    """Faults of the portrait of an oscillator, and counts of cases set aside, by reason.
 
-    Starts are compared as far as the portrait goes, |x1| and |x2| < reach.
+    Starts are compared within the portrait's reach, |x1| and |x2| < reach.
     """
     aside: Counter = Counter()
     centres = [float(r.x1) for r in told.equilibria if abs(float(r.rate)) < CENTRE]
@@ -160,7 +159,7 @@ def differences(osc: engine.Oscillator, told: jb.Portrait) -> tuple[list[str], C
 
 
 def _number_of(seen: engine.Attractor, told: jb.Portrait) -> int:
-    """The number of an attractor in the portrait: cycles first, then equilibria; -1: none."""
+    """Number of an attractor in the portrait: cycles first, then equilibria; -1 if not in it."""
     if seen.kind == "cycle":
         for number, cycle in enumerate(told.cycles):
             mine = float(cycle.x1_min), float(cycle.x1_max), float(cycle.period)
@@ -171,7 +170,7 @@ def _number_of(seen: engine.Attractor, told: jb.Portrait) -> int:
     end = -inf
     for row, rest in enumerate(told.equilibria):
         holds = int(rest.kind) == jb.EquilibriumKind.SEGMENT
-        # Pieces of one segment are one.
+        # Adjacent segments count as one.
         if not (holds and abs(float(rest.x1_lower) - end) < 1e-12):
             number = len(told.cycles) + row
         end = float(rest.x1_upper) if holds else inf
@@ -188,7 +187,7 @@ def _is_tiny(seen: engine.Attractor, told: jb.Portrait) -> bool:
 
 
 def _has_fixed_point_at_saddle(told: jb.Portrait) -> bool:
-    """Whether the two are one up to rounding, as where they are about to vanish."""
+    """Whether a fixed point and a saddle coincide up to rounding, as before both vanish."""
     x1, kinds = np.asarray(told.equilibria.x1), np.asarray(told.equilibria.kind)
     saddles = x1[kinds == jb.EquilibriumKind.SADDLE]
     fixed = x1[kinds == jb.EquilibriumKind.FIXED_POINT]
@@ -235,8 +234,8 @@ def _not_parted(told: jb.Portrait, ids, x1s, x2s) -> list[str]:
 
 
 def _jumps(told: jb.Portrait) -> list[float]:
-    """The boundaries of belts whose static limit exceeds mu(0), from which orbits leave upwards or
-    downwards: they part motions themselves."""
+    """Boundaries x2 of belts whose static limit exceeds mu(0): orbits leave them upwards or
+    downwards, so that they separate basins."""
     belts, omega = told.oscillator.belts, float(told.oscillator.omega)
     return [
         float(b.velocity) / omega
@@ -246,7 +245,7 @@ def _jumps(told: jb.Portrait) -> list[float]:
 
 
 def _crossings(curve: np.ndarray, axis: int, level: float) -> np.ndarray:
-    """Where a curve crosses a line of the grid; ends of it on the line, up to rounding, count."""
+    """Places where a curve crosses a line of the grid; ends on the line, up to rounding, count."""
     other = curve[:, 1 - axis] - level
     other = np.where(np.abs(other) < AT_ROUNDING, 0.0, other)
     i = np.flatnonzero(other[1:] * other[:-1] <= 0)
@@ -255,7 +254,7 @@ def _crossings(curve: np.ndarray, axis: int, level: float) -> np.ndarray:
 
 
 def _repels(osc: engine.Oscillator, cycle: jb.Cycle, told: jb.Portrait) -> bool:
-    """Whether starts on both sides of its top leave a cycle, in one loop."""
+    """Whether runs from both sides of a cycle's maximum of x1 leave the cycle in one loop."""
     top = float(cycle.x1_max)
     tops = [float(one.x1_max) for one in (*told.cycles, *told.unstable) if one is not cycle]
     nearest = min([1.0, *(abs(other - top) for other in tops)])
@@ -272,8 +271,8 @@ def _repels(osc: engine.Oscillator, cycle: jb.Cycle, told: jb.Portrait) -> bool:
 
 
 def _slope(osc: engine.Oscillator, cycle: jb.Cycle) -> float:
-    """The slope of the map from top to top at a cycle, by differences; that of steep ones, and of
-    small cycles, as it is told: there differences say nothing."""
+    """Slope of the map from top to top at a cycle, by differences. For steep maps and small cycles
+    the cycle's own multiplier, because differences are useless there."""
     size, multiplier = float(cycle.x1_max - cycle.x1_min), float(cycle.multiplier)
     if multiplier > STEEP or size < SMALL:
         return multiplier
@@ -281,7 +280,7 @@ def _slope(osc: engine.Oscillator, cycle: jb.Cycle) -> float:
     for side in (-1e-6, 1e-6):
         start = float(cycle.x1_max) + side * size, 0.0
         run = engine.simulate(osc, start, 2 * float(cycle.period), turns=True)
-        # At the boundary of a belt at rest a top is an event of that.
+        # At the boundary of a belt at rest a top is an event of that belt.
         late = (run.t > 0.5 * float(cycle.period)) & (np.abs(run.y[:, 1]) < AT_TOP)
         tops = run.y[late, 0]
         tops = tops[np.abs(tops - float(cycle.x1_max)) < 1e-3 * size]
@@ -290,7 +289,7 @@ def _slope(osc: engine.Oscillator, cycle: jb.Cycle) -> float:
 
 
 def outcome(options, number: int) -> Outcome:
-    """Compare one random portrait."""
+    """Compares one random portrait."""
     rng = np.random.default_rng((options.seed, number))
     kind, osc = random_oscillator(rng)
     own = units.drawn(rng, exact=kind not in ("paper", "random"))

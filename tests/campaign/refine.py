@@ -1,13 +1,13 @@
-"""Guesses beside points that `scan` knows: whether `refine` finds them from there.
+"""Guesses beside points of `scan`: whether `refine` finds the points from there.
 
-Along random paths, those of the campaign `paths`, `scan` finds points. From either side of each, at
-several distances, `refine` is asked for its condition, as a user would. It is right where it gives
-the point, or another one of that kind that is no farther from the guess: one between the two, or
-one that is nearer on the other side of the guess. Whether something happens there `scan` has to
-say, too, on a short path across it; what happens to an unstable cycle alone, `bifurcation_diagram`.
+Along random paths, those of the campaign `paths`, `scan` finds points. From guesses on either side
+of each point, at several distances, `refine` solves its condition, as a user would. The result is
+right if it is the point, or another one of that kind that is no farther from the guess: between
+both, or closer on the other side of the guess. Another point has to be confirmed by `scan` on a
+short path across it, or by `bifurcation_diagram`, which also has points of unstable cycles.
 
-The mirror image of the oscillator is asked the same: x1 and x2 with other signs, and the belts in
-reverse order. It has to answer alike.
+`refine` also runs on the mirror image of the oscillator: x1 and x2 with opposite signs, and the
+belts in reverse order. Both results have to agree.
 """
 
 import time
@@ -19,17 +19,17 @@ from jaxbelt.results import Status
 from . import paths
 from .outcome import Outcome
 
-#: How far the guesses are from the points.
+#: Distances of the guesses from the points.
 AWAY = (1e-3, 1e-2, 3e-2)
-#: Two values of one point differ by less: both are solved for to rounding, some of them in systems
-#: that amplify it.
+#: Largest difference of two values of one point: both are solved for to rounding, which some
+#: systems amplify.
 SAME = 1e-7
-#: What counts as right.
+#: Verdicts that count as right.
 GOOD = ("found", "between", "nearer")
 
 
 def outcome(options, number: int) -> Outcome:
-    """Ask beside all points of one path."""
+    """Runs `refine` beside all points of one path."""
     case = paths.case_of(options.seed, number)
     middle = case.given(0.5 * sum(case.span))
     known = [p for p in jb.scan(middle, case.where, case.given_span) if p.status == Status.OK]
@@ -63,18 +63,18 @@ def said(counts, largest) -> list[str]:
 
 
 def _in_engines(case: paths.Case, point):
-    """A point with its value as in the engine's units."""
+    """A point with its value and error in the engine's units."""
     return replace(point, value=point.value / case.measured, error=point.error / case.measured)
 
 
 def _guesses(case: paths.Case, value: float) -> list[float]:
-    """Values beside that of a point at which there is an oscillator."""
+    """Values beside that of a point at which the oscillator is possible."""
     every = [value + side * away for away in AWAY for side in (-1, 1)]
     return [guess for guess in every if paths.is_possible(case.at(guess))]
 
 
 def _verdict(case: paths.Case, point, guess: float, found) -> str:
-    """found, between, nearer; wrong; or none."""
+    """Returns "found", "between", "nearer", "wrong", or "none" where the status is not OK."""
     if found.status != Status.OK:
         return "none"
     at, value = float(point.value), float(found.value)
@@ -82,7 +82,7 @@ def _verdict(case: paths.Case, point, guess: float, found) -> str:
         return "found"
     if abs(value - guess) > abs(at - guess):
         return "wrong"
-    # Another call has to know it, too; by another name, where two things happen at once.
+    # Another call has to find it, too; its kind may differ where two things happen at once.
     ends = (value - 2e-3) * case.measured, (value + 1.9e-3) * case.measured
     path = case.given(guess), case.where, ends
     calls = jb.scan, lambda *path, **options: jb.bifurcation_diagram(*path, **options).points
@@ -100,13 +100,13 @@ def _is_among(case: paths.Case, value: float, points) -> bool:
 
 # --- mirror images --------------------------------------------------------------------------------
 
-#: Numbers that have another sign in the mirror image.
+#: Numbers that change sign in the mirror image.
 _TURNED = ("velocity", "lower", "upper")
 
 
 def mirror_image(case: paths.Case) -> paths.Case:
-    """The path of which the motions are those of another one with -x1 and -x2, and the belts in
-    reverse order. A velocity or an edge is minus that of the path."""
+    """The path whose motions are those of the given one with -x1 and -x2, and with the belts in
+    reverse order. Velocities and edges have the opposite sign."""
     belts = [
         replace(belt, velocity=-belt.velocity, lower=-belt.upper, upper=-belt.lower)
         for belt in reversed(case.oscillator.belts)
@@ -124,7 +124,7 @@ def _mirrored_value(case: paths.Case, value: float) -> float:
 
 
 def mirrored_condition(condition, count: int):
-    """The condition on the mirror image of an oscillator with so many belts."""
+    """The condition for the mirror image of an oscillator with `count` belts."""
 
     def turned(value):
         if isinstance(value, tuple):
@@ -136,7 +136,7 @@ def mirrored_condition(condition, count: int):
 
 
 def _unlike(case: paths.Case, image: paths.Case, condition, guess: float, found) -> list[str]:
-    """What the mirror image answers, if that is something else."""
+    """Lines on the result for the mirror image, if it differs from `found`; else none."""
     value = _mirrored_value(case, guess)
     osc = image.given(value)
     condition = mirrored_condition(condition, len(osc.belts))

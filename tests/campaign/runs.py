@@ -13,13 +13,13 @@ import numpy as np
 from . import cases, compare, derivatives, engine, package, units
 from .outcome import Outcome
 
-#: Runs in one batch, of which those on round numbers share their units, and the others.
+#: Runs in one batch; those on round numbers share their units, and so do the others.
 BATCH = 512
 
 
 def settings(options):
     names = ["runs", "by", "structure", "tol", "extreme_share"]
-    # Files of results that were written before there were any have no such setting.
+    # Files of results from before these options existed lack these settings.
     names += [name for name in ("heavy", "regime") if getattr(options, name)]
     return {name: getattr(options, name) for name in names}
 
@@ -33,7 +33,7 @@ def outcome(options, number):
     rng = np.random.default_rng((options.seed, number))
     batch = [_case(rng, structure, options) for _ in range(count)]
     one = Outcome(f"{count} runs")
-    # Only powers of two keep round numbers round, and distances of 1e-11.
+    # Only powers of two as units keep round numbers round, and distances of 1e-11 exact.
     for is_exact in (True, False):
         own = units.drawn(np.random.default_rng((options.seed, number, is_exact)), exact=is_exact)
         some = [replace(c, units=own) for c in batch if _wants_exact(c) == is_exact]
@@ -47,7 +47,7 @@ def _wants_exact(case):
 
 
 def _compare(batch, one, rng, options):
-    """Compare runs of one call."""
+    """Compares runs of one call."""
     labels = options.what == "attractors" or options.by == "find_cycle"
     judge = compare.judge_label if labels else compare.judge
     if labels and options.by != "find_cycle":
@@ -66,7 +66,7 @@ def _compare(batch, one, rng, options):
 
 
 def said(counts, largest):
-    """The rows of the table in `docs/checked.md`, then how often what was wrong."""
+    """Rows of the table in `docs/checked.md`, then counts of wrong verdicts and of derivatives."""
     verdicts = [(*name.split("|"), n) for name, n in counts.items() if "|" in name]
     rows = []
     for kind in sorted({kind for kind, *_ in verdicts}):
@@ -82,18 +82,18 @@ def said(counts, largest):
         rows.append(f"| {what} | {kind} | {runs} | {tol} | {tolerance} | {corner} | {wrong} |")
     rows += [f"{n} {kind}: {v}" for kind, v, _, _, n in verdicts if v not in compare.GOOD]
     if counts["derivatives"]:
-        # The others are as near as the tolerance of the runs lets them be.
+        # The others are right within the tolerance of the runs.
         rows.append(f"{counts['derivatives to 1e-7']} of {counts['derivatives']} to 1e-7")
     return rows
 
 
 def _batches(options):
-    """A structure and a number of runs each."""
+    """Pairs of a structure and a number of runs."""
     if options.what == "grazing" and options.by == "find_cycle":
         return [(None, min(BATCH, options.runs - n)) for n in range(0, options.runs, BATCH)]
     structures = cases.structures(np.random.default_rng(options.seed), cases.STRUCTURES)
     structures = cases.REGIMES.get(options.regime, structures)
-    # Half of them in the commonest structure of two belts with edges; of grazing all alike.
+    # The first structures have the most runs; for grazing all have equally many.
     shares = np.array([2.0 / (1 + i) for i in range(len(structures))])
     if options.what == "grazing":
         shares[:] = 1.0
@@ -137,17 +137,17 @@ def _ask(batch, options):
 
 
 def _judged(judge, batch, told, options):
-    """The verdicts, and what the engine has; judged on several threads."""
+    """The verdicts and the engine's results, judged on several threads."""
     pool = ThreadPoolExecutor(options.threads)
     try:
         return list(pool.map(lambda case, answer: judge(case, answer, options.tol), batch, told))
     finally:
-        # An interrupt does not wait for those that have not begun.
+        # After an interrupt, cases that have not begun are dropped.
         pool.shutdown(cancel_futures=True)
 
 
 def _count(one, options, kind, verdict, case, told, right, **more):
-    """Count a verdict, and tell all of its case where it is not right."""
+    """Counts a verdict; a wrong one is recorded with its whole case."""
     asked = options.what in ("grazing", "derivatives")
     what = options.what + (f", {options.by}" if asked else "")
     one.counts[f"{kind}|{verdict}|{what}|{options.tol:g}"] += 1
@@ -157,7 +157,7 @@ def _count(one, options, kind, verdict, case, told, right, **more):
 
 
 def _plain(value):
-    """A result as JSON takes it, without the arrays of events beyond the first few."""
+    """A result in types that JSON has, with the first few events only."""
     if isinstance(value, np.ndarray):
         return value.tolist()
     out = {}
@@ -176,8 +176,8 @@ def _plain(value):
 
 
 def _has_derivatives(mine, run, options):
-    """Whether derivatives are asked of a run, `mine` the engine's: near grazing always, else where
-    it goes on until T, or to a pseudo-focus, and comes near to no other outcome, or to a corner."""
+    """Whether derivatives of a run are compared; mine: the engine's run. Near grazing always, else
+    if it lasts until T or ends in a pseudo-focus, and its margin is large, or that of a corner."""
     if options.what == "derivatives" and options.by == "find_cycle":
         return mine.kind == "cycle" and mine.margin > 1e-6
     if options.what == "derivatives":
@@ -188,7 +188,7 @@ def _has_derivatives(mine, run, options):
 
 
 def _differentiate(one, runs, rng, options):
-    """Derivatives of the runs that were right, each along a direction of its own."""
+    """Compares derivatives of the runs that were right, each along its own direction."""
     some = [case for case, _, _ in runs]
     along = [derivatives.directions(case, rng) for case in some]
     told = package.derivatives(some, along, options.tol, options.by)
@@ -205,7 +205,7 @@ def _differentiate(one, runs, rng, options):
 
 
 def _differentiate_cycles(one, runs, rng, options):
-    """Derivatives of the periods of the cycles that were right."""
+    """Compares derivatives of the periods of the cycles that were right."""
     runs = [(case, mine) for case, mine, _ in runs if mine.kind == "cycle"]
     along = [derivatives.directions(case, rng) for case, _ in runs]
     told = package.period_derivatives([case for case, _ in runs], along)

@@ -1,14 +1,14 @@
-"""Minimal fatal shocks: what `minimal_fatal_shock` tells against bisection by the engine.
+"""Minimal fatal shocks: the result of `minimal_fatal_shock` against bisection by the engine.
 
 For an oscillator at random, one of its attractors and a direction, four things must hold.
 
 - The start is on the attractor: the engine stays there for a loop.
-- Along the shock, the engine's runs lead to the attractor until the distance told, and elsewhere
-  beyond; bisection finds where this changes.
+- Along the shock, the engine's runs lead to the attractor up to the distance of the result, and
+  elsewhere beyond; bisection finds where this changes.
 - No smaller shock is fatal: from states all along the attractor shocks in many directions, a
   thousandth smaller than the smallest fatal one, lead back to it.
-- The derivative of the distance along a direction at random in the space of oscillators is that of
-  bisection: a difference of four oscillators beside, extrapolated.
+- The derivative of the distance along a random direction in the space of oscillators is that of
+  bisection: a difference of oscillators beside, extrapolated.
 """
 
 from math import inf
@@ -24,23 +24,23 @@ from .cases import Case
 from .outcome import Outcome
 from .portraits import PATIENCE, _number_of, random_oscillator
 
-#: Errors of distances, and of derivatives relative to 1 and their size.
+#: Largest errors of distances, and of derivatives relative to 1 plus their size.
 SAME, SAME_SLOPE = 1e-8, 1e-6
-#: Smaller distances are set aside: there may be no difference of them.
+#: Smallest distance that is compared; differences of smaller ones may not exist.
 LEAST = 1e-3
-#: Phases, and angles of shocks in both directions, from and in which smaller shocks are tried.
+#: Number of phases of a cycle from which, and of angles at which, smaller shocks are tried.
 PHASES, ANGLES = 12, 8
-#: Runs repeat to this: nearer to an unstable cycle one is not told from it.
+#: Distance to which runs have to repeat; closer to an unstable cycle they count as on it.
 REPEATS = 1e-11
-#: Loops of the slowest cycle after which one is told: half of the latest piece of a run, which is
-#: doubled, repeats.
+#: Loops of the slowest cycle that a run must last for the cycle to be recognised: half of the last
+#: piece of the run, which is doubled, has to repeat.
 LOOPS = 50
-#: Changes of parameters for the differences: the first with which nothing else becomes the nearest
-#: and the two differences that are extrapolated are as near to one another.
+#: Steps of the differences: the first is used with which the nearest boundary stays the same and
+#: the two differences that are extrapolated agree within ALIKE.
 STEPS, ALIKE = (3e-4, 3e-5, 3e-6), 1e-4
-#: Starts that are farther apart than this beside one another are of two ways.
+#: Distance between starts of neighbouring oscillators above which the shocks are different ones.
 ELSEWHERE = 0.1
-#: Number of what goes to infinity; of what is told nowhere.
+#: Numbers of a run that goes to infinity, and of a run whose end is unknown.
 INFINITY, UNKNOWN = 1000, -1
 
 
@@ -56,11 +56,11 @@ def label(osc: engine.Oscillator, told: jb.Portrait, y0) -> int:
 
 
 def bisected(osc: engine.Oscillator, told: jb.FatalShock, end: int) -> float:
-    """The distance from the start, along the shock, from where on the engine's runs do not lead to
-    the attractor, the number `end` of the portrait; NaN where they do not do so around the shock.
+    """Distance from the start, along the shock, at which the engine's runs stop leading to the
+    attractor with the number `end` of the portrait; NaN if there is no such change near the shock.
 
-    A shock that leads to a sharp corner misses what is behind it. Then the way leads as near beside
-    the corner as distances are compared, where runs do not lead to the attractor.
+    A shock that leads to a sharp corner of the basin misses the outside. Then its direction moves
+    to states beside the corner that lead elsewhere, by less than the accuracy of the comparison.
     """
     start, shock = (np.asarray(one, float) for one in (told.start, told.shock))
     # The basin beyond may be a thin strip there.
@@ -84,7 +84,7 @@ def bisected(osc: engine.Oscillator, told: jb.FatalShock, end: int) -> float:
         middle = 0.5 * (inside + outside)
         found = label(osc, told.portrait, start + middle * shock)
         if found == UNKNOWN:
-            # On the boundary, as far as can be told.
+            # On the boundary up to the accuracy of the runs.
             inside = outside = middle
         elif found == end:
             inside = middle
@@ -94,7 +94,7 @@ def bisected(osc: engine.Oscillator, told: jb.FatalShock, end: int) -> float:
 
 
 def differences(osc, y0, direction: str, told: jb.FatalShock) -> tuple[list[str], float]:
-    """What is wrong with the shock told for an oscillator, and the error of its distance."""
+    """Faults of the package's shock for an oscillator, and the error of its distance."""
     end = label(osc, told.portrait, y0)
     start, wrong = np.asarray(told.start, float), []
     if label(osc, told.portrait, start) != end:
@@ -135,8 +135,8 @@ def _smaller_ones(osc, told: jb.FatalShock, end: int, direction: str) -> list[st
 
 
 def slope_error(osc, y0, direction: str, along) -> tuple[float, float] | None:
-    """The error of the derivative along a direction of the parameters, and that of bisection; None
-    if beside the oscillator, on one side at least, another boundary is the nearest, or the same one
+    """Error of the derivative along a direction of the parameters, and size of bisection's; None if
+    for oscillators beside, on one side at least, another boundary is the nearest, or the same one
     elsewhere: at round numbers, where things coincide, or where the motion is point-symmetric."""
 
     def shock(by):
@@ -156,7 +156,7 @@ def slope_error(osc, y0, direction: str, along) -> tuple[float, float] | None:
         if len(sorts) == 1 and np.max(apart) < ELSEWHERE:
             values = {by: by_bisection(by, one) for by, one in told.items()}
             whole, half, quarter = ((values[by] - values[-by]) / (2 * by) for by in sizes)
-            # The second derivative may jump here: neither |by| by nor by^3 is left.
+            # The second derivative may jump here: terms |by| by and by^3 both cancel.
             right = (8 * quarter - 6 * half + whole) / 3
             if abs(half - whole) < ALIKE * (1 + abs(right)) or step == STEPS[-1]:
                 return abs(float(slope) - right), abs(right)
@@ -164,7 +164,7 @@ def slope_error(osc, y0, direction: str, along) -> tuple[float, float] | None:
 
 
 def random_shock(rng: np.random.Generator):
-    """A kind, an oscillator, a start, a direction, and the shock told for them."""
+    """A kind, an oscillator, a start, a direction, and the package's shock for them."""
     while True:
         kind, osc = random_oscillator(rng)
         told = jb.portrait(package.oscillator(osc))
@@ -178,7 +178,7 @@ def random_shock(rng: np.random.Generator):
 
 
 def outcome(options, number: int) -> Outcome:
-    """Compare one random shock."""
+    """Compares one random shock."""
     rng = np.random.default_rng((options.seed, number))
     kind, osc, y0, direction, told = random_shock(rng)
     along = derivatives.directions(Case(osc, y0), rng)

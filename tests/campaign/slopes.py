@@ -1,9 +1,9 @@
 """Derivatives of bifurcation points by other parameters, against differences of their values.
 
-Along random paths, those of the campaign `paths`, `scan` finds points. Of each the derivative of
-the value that `refine` gives, along a random direction of all other numbers of the oscillator, is
-compared with a Richardson difference of values that `refine` gives beside, each by a solution of
-its own; the values themselves are compared with the engine's by `paths`.
+Along random paths, those of the campaign `paths`, `scan` finds points. For each the derivative
+of the value of `refine`, along a random direction of the oscillator's numbers, is compared with a
+Richardson difference of values of `refine` for oscillators beside, each solved for separately. The
+values themselves are compared with the engine's by `paths`.
 """
 
 import jax
@@ -16,14 +16,14 @@ from . import derivatives, package, paths
 from .cases import Case
 from .outcome import Outcome
 
-#: Steps of the differences, and what they may be off: values are known to 1e-11 or so.
+#: Step of the differences, and their tolerance: values are known to 1e-11 or so.
 STEP, ROOM = 2e-4, 1e-5
 #: After so many paths compiled programs are dropped: a thousand of them fill the memory.
 TOGETHER = 10
 
 
 def outcome(options, number: int) -> Outcome:
-    """Differentiate all points of one path."""
+    """Compares derivatives of all points of one path."""
     case = paths.case_of(options.seed, number)
     if number % TOGETHER == 0:
         jax.clear_caches()
@@ -43,7 +43,7 @@ def outcome(options, number: int) -> Outcome:
 
 
 def _compared(case: paths.Case, osc, point, along):
-    """A verdict, the derivative told, and that of differences."""
+    """A verdict, the package's derivative, and that of differences."""
 
     def value(by):
         moved = package.oscillator(derivatives.moved(osc, along, by))
@@ -55,7 +55,7 @@ def _compared(case: paths.Case, osc, point, along):
         return jb.refine(point.condition, package.oscillator(moved), where=case.where).value
 
     _, told = jax.jvp(traced, (jnp.asarray(0.0),), (jnp.asarray(1.0),))
-    # The parameter itself moves, too, as a guess.
+    # The parameter of the path moves, too, but it is only the guess.
     values = {h: value(h) for h in (-STEP, -STEP / 2, STEP / 2, STEP)}
     whole, half = ((values[h] - values[-h]) / (2 * h) for h in (STEP, STEP / 2))
     right, told = (4 * half - whole) / 3, float(told)

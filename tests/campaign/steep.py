@@ -1,9 +1,9 @@
-"""Steep laws: where oscillators lead whose friction falls within 1e-1 to 1e-4 of a belt's velocity.
+"""Steep laws: attractors of oscillators whose friction falls within 1e-1 to 1e-4 of a belt's speed.
 
-Half of them have round numbers. Each is asked of `find_cycle`, of `sweep` and of the engine. A case
-of this campaign is a batch of oscillators of one structure, half of it a call of the sweep. Two of
-each batch are scanned along the velocity of a belt, twice, the second time warm; a point without a
-name has to say what there is on both sides.
+Half of the oscillators have round numbers. The attractor of each is found by `find_cycle`, by
+`sweep` and by the engine. A case of this campaign is a batch of oscillators of one structure; each
+half is one call of the sweep. Two of each batch are scanned along the velocity of a belt, twice,
+the second time warm; a point without a name has to state the motions on both sides.
 """
 
 import functools
@@ -19,7 +19,7 @@ from . import cases, compare, package, units
 from .engine import Belt, Oscillator
 from .outcome import Outcome
 
-#: Laws of the belts; of the second belt, too, where there are two.
+#: Laws of the belts, one for each belt.
 STRUCTURES = (("peak",), ("conti",), ("stribeck",), ("table",), ("peak", "stribeck"))
 #: Oscillators in a batch.
 BATCH = 20
@@ -48,7 +48,7 @@ def outcome(options, number):
 
 
 def _scan(case_, one):
-    """Scan one oscillator, from half of the velocity of its first belt to twice that."""
+    """Scans one oscillator, from half of the velocity of its first belt to twice that."""
     osc = package.oscillator(case_.oscillator)
     velocity = float(osc.belts[0].velocity)
     span = tuple(sorted((0.5 * velocity, 2.0 * velocity)))

@@ -1,8 +1,8 @@
-"""Units in which the package is asked: a user's, drawn for each call.
+"""Units in which the package gets a case: a user's, drawn for each call.
 
-Cases are drawn and the engine runs in units in which sizes are of order one. The package is asked
-the same in a unit of length and at a frequency of somebody's: 2^-24 to 2^24 or 10^-7 to 10^7 of
-them, and frequencies of 2^-10 to 2^10 or 10^-3 to 10^3. Its answers are brought back.
+Cases are drawn, and the engine runs, in units in which sizes are of order one. The package gets the
+same case in random units: lengths are multiplied by 2^-24 to 2^24 or 10^-7 to 10^7, frequencies by
+2^-10 to 2^10 or 10^-3 to 10^3. Its answers are converted back.
 """
 
 from dataclasses import dataclass, replace
@@ -13,8 +13,8 @@ from jaxbelt.model.own_units import rescaled
 
 from . import engine
 
-#: Powers of a speed by which the numbers of a law, behind its static limit, change; none for what
-#: is no coefficient.
+#: Powers of the unit of speed by which the numbers of a law after its static limit are multiplied;
+#: 0 for coefficients.
 _SPEEDS = {
     "conti": (0, -1, -2),
     "coulomb": (0,),
@@ -25,7 +25,7 @@ _SPEEDS = {
 _NAMES = {"damping": "number", "velocity": "speed"} | dict.fromkeys(
     ("load", "lower", "upper"), "length"
 )
-#: Those of a law as a path names them.
+#: Numbers of a law by the names that paths use.
 _LAW = {
     "conti": ("static", "residual", "steepness", "quadratic"),
     "coulomb": ("static", "kinetic"),
@@ -35,8 +35,8 @@ _LAW = {
 
 @dataclass(frozen=True)
 class Units:
-    """The user's: so many of them are a length of the engine's, and so many times as high is a
-    frequency."""
+    """Units of a user. length, frequency: factors by which the engine's lengths and frequencies are
+    multiplied."""
 
     length: float = 1.0
     frequency: float = 1.0
@@ -68,7 +68,7 @@ class Units:
         )
 
     def of(self, osc: engine.Oscillator, parameter: tuple[int, str]) -> float:
-        """How many of the user's units one of a parameter, (belt or -1, name), is."""
+        """Factor by which a parameter, (belt or -1, name), is multiplied."""
         number, name = parameter
         if not name.startswith("law "):
             return {"number": 1.0, "speed": self.speed, "length": self.length}[_NAMES[name]]
@@ -77,16 +77,16 @@ class Units:
         return self.speed ** (0, *_SPEEDS[law])[place]
 
     def back(self, result, osc):
-        """A result of the package in the engine's units; osc: the package's oscillator in them."""
+        """A result of the package in the engine's units; osc: the oscillator in these units."""
         return result if self == ENGINES else rescaled(result, 1 / self.length, lambda _: osc)
 
 
-#: Those of the engine.
+#: Units of the engine.
 ENGINES = Units()
 
 
 def drawn(rng: np.random.Generator, *, exact: bool) -> Units:
-    """Units at random; exact: powers of two, which keep what is equal or round as it is."""
+    """Random units; exact: powers of two, which keep equal numbers equal and round ones round."""
     if exact or rng.random() < 0.5:
         return Units(2.0 ** int(rng.integers(-24, 25)), 2.0 ** int(rng.integers(-10, 11)))
     return Units(10.0 ** int(rng.integers(-7, 8)), float(10 ** rng.uniform(-3, 3)))
