@@ -219,15 +219,17 @@ class ParameterPath:
         """
         own_first = [belt for one in self.conditions for belt in one.belts_concerned]
         belts: list[int] = []
-        known: set[float] = set()
-        all_belts = self.at(0.5 * (self.first + self.last)).belts
-        # A load that varies may be zero at an end, or in the middle.
+        # At one value a load may be zero, or two edges may meet that are not shared.
         spread = [self.first + part * self.length for part in (0.0, 0.29, 0.61, 1.0)]
-        loads = np.array([[float(belt.load) for belt in self.at(v).belts] for v in spread])
-        pressed = np.flatnonzero(np.any(loads != 0, axis=0)).tolist()
+        along = [*zip(*(self.at(value).belts for value in spread), strict=True)]
+        pressed = [k for k, same in enumerate(along) if any(float(b.load) != 0 for b in same)]
+        known: set[tuple[float, ...]] = set()
         for number in dict.fromkeys([*own_first, *pressed]):
-            belt = all_belts[number]
-            own = {float(edge) for edge in (belt.lower, belt.upper) if np.isfinite(edge)}
+            ends = (
+                tuple(float(getattr(belt, name)) for belt in along[number])
+                for name in ("lower", "upper")
+            )
+            own = {end for end in ends if np.all(np.isfinite(end))}
             if own - known:
                 belts.append(number)
             known |= own
