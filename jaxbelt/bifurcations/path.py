@@ -193,10 +193,15 @@ class ParameterPath:
             for key, one in followed.items():
                 self.unstable_cycles.setdefault(key, one)
 
+    @property
+    def closest(self) -> float:
+        """Distance of two values that are told apart where motions converge fast."""
+        # Not closer in a short span: a loop counts as repeated when it repeats to 1e-7.
+        return CLOSE * (self.unit + self.length)
+
     def beside(self, value: float, *, slow: bool = False) -> tuple[float, float]:
         """Values just below and above `value`; slow: farther off, as motions converge slowly."""
-        # Not closer in a short span: a loop counts as repeated when it repeats to 1e-7.
-        distance = CLOSE * (self.unit + self.length)
+        distance = self.closest
         far = value - 30.0 * distance, value + 30.0 * distance
         if slow:
             return far

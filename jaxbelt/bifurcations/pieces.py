@@ -119,6 +119,8 @@ def nodes_of_stretch(path: ParameterPath, a: float, b: float, rows: int) -> np.n
     inner = 0.5 * (1 - np.cos(np.linspace(0, np.pi, count)))
     first = path.beside(a)[1] if a in path.breaks or a != path.first else a
     last = path.beside(b)[0] if b in path.breaks or b != path.last else b
+    if first >= last:  # the range beside one of them reaches the other
+        first, last = a + path.closest, b - path.closest
     return first + (last - first) * inner
 
 

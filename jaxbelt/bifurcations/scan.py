@@ -151,10 +151,16 @@ def search(
         if b > a:
             stretches.append(np.linspace(a, b, 1 + max(1, round((b - a) / width))))
     path.find_labels(np.concatenate(stretches))
-    explained = [path.beside(at) for at in path.breaks]
-    explained += [path.beside(float(point.value)) for point in known]
-    for point in known:
-        path.find_labels(path.beside(float(point.value)))
+    explained = [path.beside(float(point.value)) for point in known]
+    path.find_labels([value for ends in explained for value in ends])
+    # A label beside a point may lie beyond the span.
+    explained += [(-np.inf, first), (last, np.inf)]
+    margins: list[tuple[float, float]] = []
+    for at in path.breaks:
+        inner, wide = _inner_and_margins(path, at, *path.beside(at))
+        explained.append(inner)
+        margins += wide
+    path.find_labels([value for margin in margins for value in margin])
     while intervals := path.changes(explained):
         if path.attempts > MOST_ATTEMPTS:
             points += _left(path, intervals)
@@ -165,15 +171,23 @@ def search(
         for a, b in intervals:
             is_narrow, is_near = b - a <= NEAR * path.length, b - a <= near * path.length
             point = _explained(path, a, b) if is_near else None
-            if point is not None and _accepts(path, a, b, point):
+            is_beside = any(low <= a and b <= high for low, high in margins)
+            if point is not None and _accepts(path, a, b, point, only_inside=is_beside):
                 point = more_exact(point, path.variation)
                 # The interval on the other side of a fold may have led to it already.
                 for one in (point, *_beside_it(path, a, b, point)):
                     if not any(_is_same_point(one, other) for other in points):
                         points.append(one)
                 before, after = _explained_range(path, a, b, point)
-                explained.append((before, after))
-                values += [max(a, before), min(b, after)]
+                inner, wide = _inner_and_margins(path, float(point.value), before, after)
+                explained.append(inner)
+                margins += wide
+                values += [max(a, before), min(b, after), *(v for one in wide for v in one)]
+            elif is_beside:
+                if b - a <= path.closest:
+                    explained.append((a, b))
+                else:
+                    values.append(0.5 * (a + b))
             elif is_near and point is None and _is_degenerate(path, a, b, points):
                 explained.append((a, b))
             elif b - a <= 1e-9 * path.length and not path.is_fine(a, b):
@@ -339,14 +353,32 @@ def _explained_range(
     return before, after
 
 
-def _accepts(path: ParameterPath, a: float, b: float, point: BifurcationPoint) -> bool:
+def _inner_and_margins(
+    path: ParameterPath, value: float, before: float, after: float
+) -> tuple[tuple[float, float], list[tuple[float, float]]]:
+    """The part of the range around a point that it explains in any case, and the rest of the range,
+    as far as it is in the span.
+
+    In the rest labels may be wrong, as motions converge slowly. What differs there is searched, as
+    another point may be there; only what leads to none is explained by the first point.
+    """
+    first, last = path.inside(path.first), path.inside(path.last)
+    low, high = value - path.closest, value + path.closest
+    inner = low if first < low else before, high if high < last else after
+    margins = (max(before, first), low), (high, min(after, last))
+    return inner, [(a, b) for a, b in margins if a < b]
+
+
+def _accepts(
+    path: ParameterPath, a: float, b: float, point: BifurcationPoint, *, only_inside: bool
+) -> bool:
     """Whether to accept the point for this interval.
 
     A point just outside is not accepted as long as the interval can be narrowed: another point may
-    be inside.
+    be inside. only_inside: nor then, as that point is known.
     """
-    low, high = path.beside(0.5 * (a + b))
-    return b - a <= high - low or _is_inside(a, b, point)
+    is_narrow = b - a <= 2 * path.closest and not only_inside
+    return is_narrow or _is_inside(a, b, point)
 
 
 def _is_inside(a: float, b: float, point: BifurcationPoint) -> bool:
