@@ -838,3 +838,13 @@ def test_the_end_of_a_segment_is_no_fixed_point():
 
 def test_a_fixed_point_on_an_edge_is_listed_once():
     assert len(jb.equilibria(jb.presets.class_c(0.3, 0.3, 0.7))) == 1
+
+
+@pytest.mark.parametrize(("unit", "omega"), [(1.0, 1.0), (3.0, 1.0), (1e5, 1 / 300), (1e5, 7.0)])
+def test_a_trace_of_zero_is_zero_in_every_unit(unit, omega):
+    """At belt velocity 0.1 friction falls by 1 for each unit of velocity, as much as damping."""
+    law = jb.Conti(1.0, 0.6, 10.0 / (unit * omega))
+    belt = jb.Belt(0.1 * unit * omega, law, load=0.5 * unit)
+    (rest,) = jb.equilibria(jb.Oscillator(1.0, (belt, belt), omega=omega))
+    assert rest.kind == FIXED_POINT and abs(rest.rate) < 1e-14
+    assert not rest.stable and not rest.neutral

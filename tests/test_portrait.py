@@ -563,3 +563,12 @@ def test_loops_around_a_fixed_point_on_an_edge_grow_as_its_rate_says():
     (rest,) = told.equilibria
     assert float(rest.x1) == end and not rest.stable
     assert len(told.cycles) == 1 and not told.unstable
+
+
+@pytest.mark.parametrize(("unit", "omega"), [(1.0, 1.0), (7.0, 1 / 300), (1e5, 1 / 300)])
+def test_a_node_with_one_direction_has_a_separatrix_in_every_unit(unit, omega):
+    """The trace at the end of the segment is exactly 2."""
+    law = jb.Conti(1.0, 0.6, 10.0 / (unit * omega))
+    belt = jb.Belt(0.0, law, load=unit, upper=-0.2 * unit)
+    portrait = jb.portrait(jb.Oscillator(2.0, (belt,), omega=omega))
+    assert len(portrait.separatrices) == 4

@@ -215,7 +215,8 @@ def _repels(osc: Oscillator, x1: Array, rightward: Array) -> Array:
     (trace,) = trace_of(osc, mode, x1, zero)
     pull = mode_acceleration(osc, mode, x1, zero)
     pushes = jnp.where(rightward, pull, -pull) > force_rounding(x1)
-    return pushes | (jnp.abs(pull) < force_rounding(x1)) & (trace >= 2)
+    is_node = trace > 2 - force_rounding(0.0)
+    return pushes | (jnp.abs(pull) < force_rounding(x1)) & is_node
 
 
 def mode_onward(osc: Oscillator, x1: Array, rightward: Array) -> Mode:

@@ -90,7 +90,7 @@ class Equilibria(eqx.Module):
             at a fixed point; at a pseudo-focus `(tr_L/a_L + tr_R/|a_R|) / (3 (1/a_L + 1/|a_R|))`,
             or -inf where a belt at rest touches, as disturbances then end in a finite time; inf at
             a saddle, which is left in a finite time; NaN for a segment.
-        stable: Whether rate < 0; for segments see above.
+        stable: Whether rate < 0, by more than rounding at fixed points; for segments see above.
         neutral: Whether it is a centre: orbits around it are closed, so it neither attracts nor
             repels. This holds where the forces on each side are the same at x2 and -x2, as without
             damping and with friction that does not depend on the speed.
@@ -281,6 +281,8 @@ def _in_zones(osc: Oscillator) -> Equilibria:
     attracts |= at_first & (up_from_below > 0)
     attracts |= at_last & (down_from_above > 0)
 
+    # Where the trace is 0 but for rounding, its sign would depend on the unit of length.
+    decays = rate < -force_rounding(0.0)
     # A fixed point on an edge is not stable where the other side pushes the mass away.
     stays = ~(on_lower & (up_from_below < 0)) & ~(on_upper & (down_from_above < 0))
     neutral = is_fixed & is_centre(osc, mode) & stays
@@ -296,7 +298,7 @@ def _in_zones(osc: Oscillator) -> Equilibria:
         jacobian=jnp.where(is_fixed[:, None, None], jacobian, jnp.nan),
         eigenvalues=jnp.where(is_fixed[:, None], eigenvalues, complex(np.nan, np.nan)),
         rate=jnp.where(is_fixed, rate, jnp.nan),
-        stable=jnp.where(is_segment, attracts, is_fixed & (rate < 0) & ~neutral & stays) & exists,
+        stable=jnp.where(is_segment, attracts, is_fixed & decays & ~neutral & stays) & exists,
         neutral=neutral,
     )
 
