@@ -142,7 +142,8 @@ ADVICE = {
     ),
     Status.NOT_IDENTIFIED: (
         "The record does not determine all of the parameters: those with a standard error that is "
-        "infinite, or larger than they are, may have any value, alone or together with another. "
+        "infinite, or larger than they are, may have quite other values, alone or together with "
+        "another, with which the record is fitted nearly as well. "
         "Fit fewer of them, tie some, or measure a motion that feels them: one that touches that "
         "belt, or slips at other speeds."
     ),

@@ -13,6 +13,8 @@ from jaxbelt import Status
 from jaxbelt.inverse.fit import _inverted, _undetermined
 from jaxbelt.inverse.record import local_cubics
 from jaxbelt.inverse.selection import Selection, parameter_sizes, selection_of
+from jaxbelt.inverse.windows import Linearization, fit_windows
+from jaxbelt.inverse.witnesses import contradicted
 
 TS = np.arange(400) * 0.1
 START = (0.0, -2.0)
@@ -254,6 +256,136 @@ def test_a_motion_that_touches_no_boundary_tells_only_a_combination():
     assert "only a combination is determined" in repr(result)
     two = jb.fit(osc, ts, x1, where=lambda o: some(o)[::3], noise=2e-3)
     assert two.status == Status.OK and two.undetermined == ()
+
+
+SWING = np.linspace(0.0, 40.0, 401)
+
+
+def swinging_beside_a_belt(seed):
+    """A free motion, by its closed form, that reaches 0.34 beside a belt with 0.45, and noise.
+
+    It tells the friction, 0.6, and neither the velocity of the belt nor its static friction.
+    """
+    w = np.sqrt(1 - 0.05**2)
+    swing = 0.3 * np.cos(w * SWING) + 0.315 / w * np.sin(w * SWING)
+    noise = 0.02 * np.random.default_rng(seed).normal(size=SWING.size)
+    return 0.6 + np.exp(-0.05 * SWING) * swing + noise
+
+
+def beside(velocity, static):
+    return jb.Oscillator(0.1, (jb.Belt(velocity, jb.Coulomb(static, 0.6)),))
+
+
+@pytest.mark.slow
+def test_a_contact_that_only_noise_suggests_identifies_nothing():
+    """A short stick lowered chi^2 by 2 to 5, and the errors were 59 standard errors with OK."""
+
+    def numbers(osc):
+        return osc.belts[0].velocity, osc.belts[0].friction.static
+
+    for seed in (11, 12, 16, 19):
+        given = swinging_beside_a_belt(seed)
+        result = jb.fit(beside(0.45, 1.1), SWING, given, where=numbers, noise=0.02)
+        assert result.status == Status.NOT_IDENTIFIED, result
+        assert "belts[0].velocity" in sum(result.undetermined, ())
+        assert np.isinf(result.standard_errors[0]) and np.isinf(result.covariance[0, 0])
+
+
+@pytest.mark.slow
+def test_errors_across_a_bent_valley_are_not_told():
+    """Damping and law trade: the truth was 6 and 8 standard errors off with OK, and a chi^2 of 14
+    more, of seven unknowns."""
+
+    def make(damping, velocity, *law):
+        return jb.Oscillator(damping, (jb.Belt(velocity, jb.Stribeck(*law)),))
+
+    def numbers(osc):
+        (belt,) = osc.belts
+        law = belt.friction
+        return osc.damping, belt.velocity, law.static, law.kinetic, law.velocity
+
+    exact = jb.simulate(make(0.1, 0.4, 1.0, 0.5, 0.3), (1.2, -0.3), 40.0, ts=SWING).ys[:, 0]
+    given = exact + 0.02 * np.random.default_rng(1005).normal(size=SWING.size)
+    result = jb.fit(make(0.12, 0.36, 1.1, 0.45, 0.25), SWING, given, where=numbers, noise=0.02)
+    assert result.status == Status.NOT_IDENTIFIED, result
+    (group,) = result.undetermined
+    assert set(group) >= {"damping", "belts[0].friction.kinetic"}
+
+
+@pytest.mark.slow
+def test_a_guess_that_is_the_motion_of_the_record_is_not_left():
+    """Its start is known from noisy data only, from which the mass came to the belt."""
+    given = swinging_beside_a_belt(4)
+    told = jb.fit(beside(0.45, 1.0), SWING, given, where=lambda o: o.belts[0].velocity, noise=0.02)
+    assert told.status == Status.NOT_IDENTIFIED
+    # 398 degrees of freedom: standard deviation 0.071.
+    assert told.reduced_chi_squared == pytest.approx(1, abs=4 * 0.071)
+
+
+@pytest.mark.slow
+def test_what_a_record_of_stick_and_slip_identifies_stays_ok():
+    def make(damping, velocity, static):
+        return jb.Oscillator(damping, (jb.Belt(velocity, jb.Coulomb(static, 0.6)),))
+
+    def numbers(osc):
+        return osc.damping, osc.belts[0].velocity, osc.belts[0].friction.static
+
+    truth = np.array([0.1, 0.3, 1.0])
+    exact = jb.simulate(make(*truth), (1.2, -0.3), 40.0, ts=SWING).ys[:, 0]
+    off = []
+    for seed in range(20):
+        given = exact + 0.02 * np.random.default_rng(seed).normal(size=SWING.size)
+        result = jb.fit(make(0.13, 0.35, 1.2), SWING, given, where=numbers, noise=0.02)
+        assert result.status == Status.OK, result
+        off.append((result.estimates - truth) / result.standard_errors)
+    # The root of a mean of 20 squares scatters by 16 per cent.
+    assert np.all(np.abs(np.sqrt(np.mean(np.square(off), axis=0)) - 1) < 4 * 0.16)
+
+
+class Given(Linearization):
+    """Residuals as functions of two parameters, in place of those of a record."""
+
+    def __init__(self, residuals, lower):
+        nothing, ones = jnp.full(2, np.inf), jnp.ones(2)
+        lowest = jnp.array([lower, -np.inf])
+        selection = Selection(((0,), (1,)), ("a", "b"), lowest, nothing, ones, ones)
+        self.selection, self.oscillator, self.residuals = selection, beside(0.45, 1.0), residuals
+
+    def linearized(self, u, starts, fresh):
+        def off(u, start):
+            return jnp.concatenate([jnp.stack(self.residuals(*self.selection.values(u))), start])
+
+        start, r = jnp.asarray(starts[0]), off(jnp.asarray(u), jnp.asarray(starts[0]))
+        slopes = jax.jacfwd(off, argnums=(0, 1))(jnp.asarray(u), start)
+        columns = jnp.concatenate([*slopes, r[:, None]], axis=1)
+        return jnp.zeros((1, 1, 2)), (columns.T @ columns)[None]
+
+
+@pytest.mark.parametrize(
+    ("residuals", "lower", "expected"),
+    [
+        pytest.param(lambda a, b: (10 * (a - 1), 20 * (b - 3)), -np.inf, (), id="as derivatives"),
+        # chi^2 rises to 4 at most, and the standard error of a is 0.1.
+        pytest.param(
+            lambda a, b: (2 * jnp.tanh(5 * (a - 1)), 20 * (b - 3)), -np.inf, (0,), id="lost nearby"
+        ),
+        # It is followed: on straight lines chi^2 is 1e9 there.
+        pytest.param(
+            lambda a, b: (10 * (a - 1), 1e4 * (b - 3 * a**2)), -np.inf, (), id="bent valley"
+        ),
+        # Of a parameter at a bound with no error, and a size of 0.1.
+        pytest.param(lambda a, b: (1 + 100 * a, 20 * (b - 3)), 0.0, (), id="at its bound"),
+        pytest.param(lambda a, b: (1 + 0.1 * a, 20 * (b - 3)), 0.0, (0,), id="anywhere above it"),
+    ],
+)
+def test_errors_that_chi2_contradicts(residuals, lower, expected):
+    problem = Given(residuals, lower)
+    u = np.array([1.0 if lower else -40.0, 3.0])
+    point = fit_windows(problem, u, np.zeros((1, 2)), np.array([True]), 0.0, np.inf)
+    slopes = np.append(np.diag(jax.jacfwd(problem.selection.values)(jnp.asarray(point.u))), [1, 1])
+    covariance = _inverted(point.blocks[0][:-1, :-1]) * slopes[:, None] * slopes
+    found = contradicted(problem, point, covariance)
+    assert tuple(np.flatnonzero(found).tolist()) == expected
 
 
 def test_local_cubics_are_exact_for_cubics():

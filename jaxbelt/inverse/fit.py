@@ -55,6 +55,7 @@ from .windows import (
     gain_left,
     known_directions,
 )
+from .witnesses import contradicted
 
 if TYPE_CHECKING:
     import pandas
@@ -100,7 +101,9 @@ class Fit(eqx.Module):
         evaluations: Number of evaluations of the motion and its Jacobian.
         status: OK; MISFIT (plausibility below 1e-6, or, where the noise was estimated, residuals of
             its size with an autocorrelation that noise has not); NOT_IDENTIFIED (no misfit, and a
-            standard error that is infinite, or larger than its parameter and than 0.1 of its unit);
+            standard error that is infinite, or larger than its parameter and than 0.1 of its unit;
+            it is infinite, too, where values that it excludes fit nearly as well: chi^2 rises less
+            than a quarter of what it says, and by less than 25);
             NO_CONVERGENCE (a further step would move the estimates by a third of a standard error);
             or NOT_FINITE.
         noise_was_estimated: Whether the noise of at least one column was estimated.
@@ -322,8 +325,7 @@ def fit(
         if judged(point).is_noise:
             break
     best = min(followed, key=_misfit_of)
-    verdict, count = (judged(best), estimated), (len(followed), problem.evaluations)
-    found = _result(oscillator, selection, record, times, values, best, *verdict, *count)
+    found = _result(problem, times, values, best, judged(best), estimated, len(followed))
     result = rescaled(found, length)
     note(repr(result).splitlines()[0])
     return result
@@ -363,8 +365,8 @@ def _checked_record(ts, x1, x2, noise):
 def _motions_from(problem, guesses, data: int, note) -> Iterator[FitPoint]:
     """Fitted motions, one for each guess.
 
-    First come the guesses whose windows come near the record, then the others, last the first guess
-    again, without windows.
+    First come those whose windows come near the record, then the others, last the motion from the
+    first guess: the start is fitted before the parameters, in windows and without them.
     """
     guess, far = next(guesses), []
     for number, (u, starts, misfit) in enumerate(itertools.chain([guess], guesses), 1):
@@ -378,9 +380,14 @@ def _motions_from(problem, guesses, data: int, note) -> Iterator[FitPoint]:
     for number, point in sorted(far, key=lambda one: _misfit_of(one[1])):
         note(f"candidate {number}, from afar")
         yield _as_one_motion(problem, point, data, note)
-    note("the guess, in one piece")
+    note("the guess itself")
     u, starts, _ = guess
-    yield fit_windows(problem, u, starts, np.arange(len(starts)) == 0, 0.0, np.inf)
+    whole = np.arange(len(starts)) == 0
+    ways = [fit_windows(problem, u, starts, whole, 0.0, np.inf, held=True)]
+    windows = fit_windows(problem, u, starts, np.full(len(starts), True), 0.0, np.inf, held=True)
+    ways.append(_as_one_motion(problem, windows, data, note, held=True))
+    best = min(ways, key=_misfit_of)
+    yield fit_windows(problem, u, best.starts, whole, 0.0, np.inf)
 
 
 def _misfit_of(point: FitPoint) -> float:
@@ -399,13 +406,15 @@ def _in_windows(problem, u, starts, data: int, note) -> FitPoint:
     return point
 
 
-def _as_one_motion(problem, point: FitPoint, data: int, note) -> FitPoint:
-    """Joins windows, stage by stage, until one is left."""
+def _as_one_motion(problem, point: FitPoint, data: int, note, held: bool = False) -> FitPoint:
+    """Joins windows until one is left. held: whether the parameters keep their values."""
     pieces, every = len(point.starts), 1
     while True:
         every = min(JOIN * every, pieces)
         fresh, relative = np.arange(pieces) % every == 0, 0.0 if every == pieces else 3e-3
-        point = fit_windows(problem, point.u, point.starts, fresh, relative, FAR_OFF * data)
+        point = fit_windows(
+            problem, point.u, point.starts, fresh, relative, FAR_OFF * data, held=held
+        )
         note(f"  {np.sum(fresh)} windows: chi^2 per datum {point.chi2 / data:.3f}")
         if every == pieces:
             return point
@@ -420,19 +429,8 @@ def _weights_of(record: Record, values: np.ndarray) -> np.ndarray:
     return np.asarray(record.weights).reshape(-1, 2)[: len(values)]
 
 
-def _result(
-    oscillator,
-    selection,
-    record,
-    ts,
-    values,
-    point,
-    verdict: Verdict,
-    estimated,
-    count,
-    evaluations,
-):
-    p = point.u.size
+def _result(problem, ts, values, point, verdict: Verdict, estimated: bool, candidates: int) -> Fit:
+    selection, p = problem.selection, point.u.size
     u = jnp.asarray(point.u)
     estimates = selection.values(u)
     slopes = np.append(np.diag(jax.jacfwd(selection.values)(u)), [1.0, 1.0])
@@ -442,18 +440,22 @@ def _result(
     covariance[np.ix_(free, free)] = _inverted(block[:-1, :-1])
     covariance *= slopes[:, None] * slopes
     errors = np.sqrt(np.diag(covariance))
-    ys, weights = _motion_of(point, values), _weights_of(record, values)
+    ys, weights = _motion_of(point, values), _weights_of(problem.record, values)
     status = Status.OK if verdict.is_noise else Status.MISFIT
     if status == Status.OK:  # Errors of a misfit mean nothing.
         if not np.all(errors[:p] <= parameter_sizes(estimates, selection.unit)):
             status = Status.NOT_IDENTIFIED
         elif not gain_left(block) < GAIN_LEFT:
             status = Status.NO_CONVERGENCE
+        else:
+            unknown = np.flatnonzero(contradicted(problem, point, covariance))
+            covariance[unknown, unknown] = errors[unknown] = np.inf
+            status = Status.NOT_IDENTIFIED if unknown.size else Status.OK
     status = status if np.isfinite(point.chi2) else Status.NOT_FINITE
     with np.errstate(divide="ignore"):
         noise = 1 / np.max(weights, axis=0)
     return Fit(
-        oscillator=selection.put(oscillator, estimates),
+        oscillator=selection.put(problem.oscillator, estimates),
         names=selection.names,
         estimates=estimates,
         standard_errors=jnp.asarray(errors[:p]),
@@ -467,8 +469,8 @@ def _result(
         reduced_chi_squared=jnp.asarray(verdict.reduced_chi_squared),
         plausibility=jnp.asarray(verdict.plausibility),
         autocorrelation=jnp.asarray(verdict.autocorrelation),
-        candidates=count,
-        evaluations=evaluations,
+        candidates=candidates,
+        evaluations=problem.evaluations,
         status=jnp.asarray(status.value),
         noise_was_estimated=estimated,
     )

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import ArrayLike
 
 from ..model.oscillator import Oscillator, has_clock
 from ..model.own_units import in_own_units
@@ -131,20 +132,41 @@ class FitPoint(eqx.Module):
 
 
 def fit_windows(
-    problem: Linearization, u, starts, fresh: np.ndarray, relative: float, far: float
+    problem: Linearization,
+    u,
+    starts,
+    fresh: np.ndarray,
+    relative: float,
+    far: float,
+    *,
+    held: ArrayLike = False,
+    enough: float = -np.inf,
+    hopeless: float = np.inf,
 ) -> FitPoint:
     """Levenberg-Marquardt iteration for one division of the record into windows.
 
-    fresh: mask of the pieces at which windows begin. It ends when chi^2 falls by less than the
-    fraction `relative`; for the whole record, when nothing is left to gain, or when chi^2 is still
-    above `far` after ITERATIONS steps.
+    It ends when chi^2 falls by less than the fraction `relative`; for the whole record, when
+    nothing is left to gain, or when chi^2 stays above `far`.
+
+    Args:
+        problem: The fit.
+        u: Parameters to begin with, [p].
+        starts: Starts of the pieces, [pieces, 2].
+        fresh: Pieces that begin a window, [pieces].
+        relative: See above.
+        far: See above.
+        held: Parameters that keep their values, [p] or one for all. The blocks have zeros for them.
+        enough: For the whole record, a smaller chi^2 ends the iteration.
+        hopeless: For the whole record, so does a larger one that a Gauss-Newton step promises.
     """
     window = np.cumsum(fresh) - 1
+    frees = np.append(np.broadcast_to(~np.asarray(held), len(u)), [True] * 3)
 
     def at(u, starts):
         ys, pieces = problem.linearized(jnp.asarray(u), jnp.asarray(starts), jnp.asarray(fresh))
+        pieces = np.where(frees[:, None] & frees, pieces, 0.0)
         blocks = np.zeros((window[-1] + 1, *pieces.shape[1:]))
-        np.add.at(blocks, window, np.asarray(pieces))
+        np.add.at(blocks, window, pieces)
         chi2 = float(np.sum(blocks[:, -1, -1]))
         return FitPoint(u, starts, np.asarray(ys), blocks, chi2)
 
@@ -156,8 +178,10 @@ def fit_windows(
             break
         if number >= ITERATIONS and point.chi2 > far:
             break
-        if is_last and gain_left(free_part(problem.selection, point)) < GAIN_ENOUGH:
-            break
+        if is_last:
+            gain = gain_left(free_part(problem.selection, point))
+            if gain < GAIN_ENOUGH or point.chi2 < enough or point.chi2 - gain > hopeless:
+                break
         # The x2 of a start at which the mass sticks loses its effect on the way there: so with a
         # clock the largest squares of the iteration damp its steps (More, 1978).
         now = _squares(point.blocks)
