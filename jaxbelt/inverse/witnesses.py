@@ -14,14 +14,14 @@ from .windows import FitPoint, Linearization, at_bounds, fit_windows
 
 #: A parameter is moved by so many standard errors, at least by this part of its size, and at most
 #: by this part of the way to its bound.
-FAR, LEAST_MOVE, INSIDE = 10.0, 1e-3, 0.9
+MOVED, LEAST_MOVE, INSIDE = 10.0, 1e-3, 0.9
 #: Standard error, in sizes, of a parameter that is at a bound and has none.
 ERROR_AT_BOUND = 0.2
 #: A value D > 1 standard errors off has to raise chi^2 by (LEAST_SHARE D)^2; CLEAR^2 is enough.
 LEAST_SHARE, CLEAR = 0.5, 5.0
 #: Where chi^2 rises more than BENT^2 times as fast as the linearised problem says, the profile is
 #: followed in these parts of the way.
-BENT, PARTS = 2.0, (0.25, 0.5, 1.0)
+BENT, ON_THE_WAY = 2.0, (0.25, 0.5, 1.0)
 
 
 def contradicted(problem: Linearization, point: FitPoint, covariance: np.ndarray) -> np.ndarray:
@@ -79,7 +79,7 @@ def contradicted(problem: Linearization, point: FitPoint, covariance: np.ndarray
             return False
         if not (rise < least_rise(distance) or rise < (BENT * distance) ** 2):
             changed = change
-            for part in PARTS:
+            for part in ON_THE_WAY:
                 changed[i] = change[i]
                 changed, distance, rise = fitted(i, part * changed, straight=False)
                 if rise < least_rise(distance) or not rise < CLEAR**2:
@@ -94,7 +94,7 @@ def contradicted(problem: Linearization, point: FitPoint, covariance: np.ndarray
         if not fixed[i] and covariance[i, i] > 0:
             change = covariance[:, i] / covariance[i, i]
         change[i] = 1.0
-        change *= max(FAR * errors[i], LEAST_MOVE * sizes[i])
+        change *= max(MOVED * errors[i], LEAST_MOVE * sizes[i])
         for sign in (-1.0, 1.0):
             if not found[i]:
                 found |= witnessed_by(i, sign * change)
