@@ -184,7 +184,8 @@ def search(
                 margins += wide
                 values += [max(a, before), min(b, after), *(v for one in wide for v in one)]
             elif is_beside:
-                if b - a <= path.closest:
+                # Narrowing it takes long there, and leads to what the first point explains.
+                if is_near or b - a <= path.closest:
                     explained.append((a, b))
                 else:
                     values.append(0.5 * (a + b))
