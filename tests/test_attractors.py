@@ -99,6 +99,7 @@ def test_near_cycles_are_two_and_a_weak_one_is_one():
     assert np.sum(every.fraction > 0, axis=-1).values.tolist() == [[1, 1], [1, 2]]
 
 
+@pytest.mark.slow(first=True)
 def test_undecided_runs_are_no_attractor(dataset):
     some = dataset.copy(deep=True)
     some.kind[0, 0, 0, 0] = 0

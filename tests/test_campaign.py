@@ -21,6 +21,9 @@ from tests.campaign import cases, compare, derivatives, engine, package, paths
 from tests.campaign.engine import CROSS, EDGE, SLIP, STICK, Belt, Oscillator
 from tests.campaign.outcome import Outcome, part
 
+# The tools of the campaigns; their engine is compiled for half a minute.
+pytestmark = pytest.mark.slow(first=True)
+
 #: The engine integrates at 1e-13, with events of order-one normal speed in these tests.
 EXACT = dict(rel=0, abs=1e-11)
 KINDS = {"STICK": STICK, "SLIP": SLIP, "CROSS": CROSS, "EDGE": EDGE}
@@ -49,7 +52,6 @@ def to_oracle(osc):
 # ---------------------------------------------------------------- the engine: closed forms
 
 
-@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("v", [0.1, -0.4])
 def test_stick_slip_is_a_circle_and_a_straight_line(v):
     # Onset at x1 = mus, a circle around mud, back at x2 = v a distance d = mus - mud before it.
@@ -68,7 +70,6 @@ def test_stick_slip_is_a_circle_and_a_straight_line(v):
     assert max(map(abs, found.x1)) == pytest.approx(mud + sqrt(d * d + v * v), **EXACT)
 
 
-@pytest.mark.slow(first=True)
 def test_a_crossing_is_a_change_of_circles():
     # Around +0.5 while x2 < 0.2, around -0.5 above; at x2 = 0.2 nothing can hold the mass.
     osc = Oscillator(0.0, (coulomb(0.2, 0.5, 0.5),))
@@ -204,7 +205,6 @@ def test_a_corner_has_the_answers_of_its_neighbours():
     assert compare.judge(case, stuck, 1e-8)[0].startswith("corner: ")
 
 
-@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("velocity", [0.4, 0.41, 0.5])
 def test_a_mode_that_does_not_last_is_none(velocity):
     """Slip onset, needed = capacity at x1 = 0.3 + 0.1 * 0.175 - 2 * 0.5, lies on the edge."""

@@ -72,6 +72,7 @@ def test_it_is_found_on_a_path_among_the_others(points, exact):
     assert points[0].value == pytest.approx(exact, abs=1e-10)
 
 
+@pytest.mark.slow(first=True)
 def test_it_is_looked_for_only_where_it_is_asked_for():
     points = jb.scan(jb.presets.class_a(0.2), nu0, (0.09, 0.15), resolution=6)
     assert points == ()

@@ -239,6 +239,7 @@ def beside_a_slow_belt(nu):
     return np.array([run.t_events[0][0] + stick, stick, 1 - 0.5 * nu + lowest])
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("nu", [1e-2, 1e-5, 1e-8, 1e-11, 1e-14])
 def test_cycles_beside_belts_that_hardly_move(nu):
     """Slip begins within nu of a fixed point that repels: an arc from there magnifies by 1 / nu."""

@@ -115,6 +115,7 @@ def test_fixed_point_of_class_a_is_that_of_the_paper():
     assert min(traces) < 0 and max(traces) > 2 and np.sum(np.abs(traces) < 2) > 50
 
 
+@pytest.mark.slow(first=True)
 def test_fixed_point_of_class_b_with_any_load_and_frequency():
     rng = np.random.default_rng(26)
     p = np.hstack(

@@ -242,11 +242,12 @@ def engine_cases(number, count, structure):
     return [forced_cases.case(rng, shape) for _ in range(count)]
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(
     ("structure", "count"),
     [
         (0, 40),  # Coulomb, one force
-        pytest.param(1, 20, marks=pytest.mark.slow(first=True)),  # cubic, one force
+        (1, 20),  # cubic, one force
         pytest.param(2, 20, marks=pytest.mark.slow),  # two belts with edges
         # Two belts with edges, a velocity that oscillates, two forces.
         pytest.param(3, 20, marks=pytest.mark.slow),
@@ -278,6 +279,7 @@ def test_a_stick_phase_ends_at_the_first_root_of_its_limits(meeting):
             assert t == pytest.approx(onset, abs=within)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("early", [1e-9, 1e-8, 1e-7, 1e-6, 1e-4])
 def test_an_edge_from_which_a_belt_carries_the_mass_and_back_is_met_at_once(early):
     """The way from the edge and back is rounding, early^2 / 8; the belt reverses `early` later."""
@@ -565,8 +567,14 @@ def test_impossible_numbers_in_a_trace_have_a_status():
     "changes",
     [
         dict(),
-        dict(forcing=(), velocity=jb.Oscillating(0.3, 0.2, 1.7)),
-        dict(forcing=jb.BaseMotion(0.4, 2.6), omega=2.0, load=0.3),
+        pytest.param(
+            dict(forcing=(), velocity=jb.Oscillating(0.3, 0.2, 1.7)),
+            marks=pytest.mark.slow(first=True),
+        ),
+        pytest.param(
+            dict(forcing=jb.BaseMotion(0.4, 2.6), omega=2.0, load=0.3),
+            marks=pytest.mark.slow(first=True),
+        ),
         dict(forcing=Pulses(jnp.array(0.4), jnp.array(1.3))),
     ],
 )

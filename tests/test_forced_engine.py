@@ -24,6 +24,9 @@ from tests.campaign.forced import (
     Oscillator,
 )
 
+# The engine is compiled for half a minute.
+pytestmark = pytest.mark.slow(first=True)
+
 # ---------------------------------------------------------------- SciPy, with its own event loop
 
 

@@ -26,6 +26,7 @@ def swept():
     return jb.sweep(_cubic, axes, y0=(0.5, 0.0), t1=60.0, progress=False)
 
 
+@pytest.mark.slow(first=True)
 def test_final_states_are_those_of_the_engine(swept):
     for i, amplitude in enumerate(swept.amplitude.values):
         for j, frequency in enumerate(swept.frequency.values):

@@ -171,14 +171,12 @@ def test_a_segment_between_the_edges():
     assert first.value == 0.65 and second.value == pytest.approx(1.0, abs=1e-14)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(
     ("make", "span"),
     [
         # The pseudo-focus stays on the edge of belt 0, to the left, and stable.
-        pytest.param(
-            *(lambda upper: beside(upper, 0.65, (0.35, -0.6)), (0.64, 0.66)),
-            marks=pytest.mark.slow(first=True),
-        ),
+        (lambda upper: beside(upper, 0.65, (0.35, -0.6)), (0.64, 0.66)),
         # The edge of a belt without load is that of nothing.
         (lambda upper: beside(upper, 0.4, loads=(1.0, 0.0)), (0.399, 0.401)),
     ],

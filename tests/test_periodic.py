@@ -937,6 +937,7 @@ def test_a_branch_does_not_come_home_the_way_that_it_has_gone():
         assert np.min(np.abs(ends - 0.325141094)) < 1e-8
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("frequency", [1.0, 0.25, 0.1])
 def test_exponents_of_a_linear_motion_are_known_where_one_is_lost_in_rounding(frequency):
     """In a period of 63 units of time the second tangent shrinks to 1e-71 of its size."""

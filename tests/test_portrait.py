@@ -565,6 +565,7 @@ def test_loops_around_a_fixed_point_on_an_edge_grow_as_its_rate_says():
     assert len(told.cycles) == 1 and not told.unstable
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(("unit", "omega"), [(1.0, 1.0), (7.0, 1 / 300), (1e5, 1 / 300)])
 def test_a_node_with_one_direction_has_a_separatrix_in_every_unit(unit, omega):
     """The trace at the end of the segment is exactly 2."""

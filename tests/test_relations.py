@@ -630,9 +630,8 @@ def test_an_image_has_the_same_attractors(image_of, seed):
             np.testing.assert_allclose(image.sign * found[other], whole[end], **close)
 
 
-@pytest.mark.parametrize(
-    "observe", ["final", pytest.param("attractor", marks=pytest.mark.slow(first=True))]
-)
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("observe", ["final", "attractor"])
 def test_a_lane_does_not_know_of_the_others(observe, monkeypatch):
     oscillators, whole = [osc for osc, _ in cases(0)], original_sweep(observe, 0)
     backwards = swept(oscillators, observe, case=np.arange(len(oscillators), dtype=float)[::-1])

@@ -391,6 +391,7 @@ def test_nor_does_one_of_the_switch_model():
 # --- formulations ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(("formulation", "width"), [("switch", "v_star"), ("smooth", "eps")])
 def test_formulations_converge_to_the_exact_one(formulation, width):
     widths = np.array([1e-3, 1e-4, 1e-5])

@@ -273,6 +273,7 @@ def test_a_zero_of_the_other_sign_is_refused_too(tmp_path):
         sweep(-0.0)
 
 
+@pytest.mark.slow(first=True)
 def test_a_law_and_a_reducer_count_by_type_numbers_and_source(tmp_path):
     def make(nu, law=Constant, mu=0.5):
         return jb.Oscillator(0.1, (jb.Belt(nu, law(jnp.asarray(mu))),))

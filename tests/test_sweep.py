@@ -459,6 +459,7 @@ def test_what_cannot_be_audited_is_refused():
         jb.sweep(jb.presets.class_b, AUDITED, t1=1.0, audit=2.0)
 
 
+@pytest.mark.slow(first=True)
 def test_an_impossible_oscillator_has_no_final_state():
     """It was the start."""
 
