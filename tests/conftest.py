@@ -4,6 +4,7 @@ import ctypes
 import gc
 import os
 import random
+import signal
 import sys
 import time
 from pathlib import Path
@@ -72,6 +73,14 @@ def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> 
             # What is free goes back to the system only when glibc is asked for that.
             if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
                 trim(0)
+
+
+@pytest.fixture
+def hears_interrupts():
+    """Interrupts are heard: tests that a shell starts in its background ignore them otherwise."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(autouse=True)

@@ -114,6 +114,7 @@ def test_killed_workers_cost_their_blocks_and_nothing_else(client, tmp_path, mon
 
 
 @pytest.mark.slow(first=True)
+@pytest.mark.usefixtures("hears_interrupts")
 def test_an_interrupt_leaves_the_workers_free(client, tmp_path):
     """A block that would take minutes: its worker hears of the interrupt, too."""
     axes = {"nu0": AXES["nu0"][:4], "nu1": [0.35]}

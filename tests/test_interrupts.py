@@ -19,14 +19,7 @@ from jaxbelt.sweeps import store, threads
 from jaxbelt.sweeps.datasets import Memory
 from jaxbelt.sweeps.question import Question
 
-
-@pytest.fixture(autouse=True)
-def _hears_interrupts():
-    """Tests that are started in the background of a shell would else ignore interrupts, too."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
+pytestmark = pytest.mark.usefixtures("hears_interrupts")
 
 #: What is started in the background of a shell would else ignore interrupts, and so its children.
 HEARS = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
