@@ -106,6 +106,7 @@ def test_undecided_runs_are_no_attractor(dataset):
     assert float(jb.attractors(some).fraction[0].sum()) == pytest.approx(11 / 12)
 
 
+@pytest.mark.slow(first=True)
 def test_impossible_datasets_are_named(dataset):
     with pytest.raises(ValueError, match="dataset must be one with an axis x1 or x2 of starts"):
         jb.attractors(dataset.isel(x1=0, x2=0))

@@ -46,6 +46,7 @@ def area_above(polygon, level):
     return 0.5 * abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("velocity", PUBLISHED)
 def test_published_basin_stability_and_area_of_the_unstable_cycle(velocity):
     n = 20_000

@@ -66,6 +66,7 @@ def test_cycle_at_a_grazing_point_goes_on():
     assert point.cycle.stick_durations[1] > 0.5 and point.multiplier == 0
 
 
+@pytest.mark.slow(first=True)
 def test_grazing_that_the_paper_does_not_list():
     """Just below nu0 = 0 the cycle sticks to belt 0 only; belt 1 comes at a grazing point."""
     point = jb.refine(jb.GrazingSliding(1), class_b(-0.06), where=nu0)
@@ -188,9 +189,8 @@ def test_a_guess_that_fits_no_such_point_is_told_so(condition, nu, status):
     assert "jb.scan with a span" in repr(point)
 
 
-@pytest.mark.parametrize(
-    "offset", [-0.03, *(pytest.param(d, marks=FIRST) for d in (-0.004, 0.004)), 0.03]
-)
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("offset", [-0.03, -0.004, 0.004, 0.03])
 def test_a_fold_from_where_newtons_method_alone_does_not_find_it(offset):
     law = jb.Conti(1.0, 0.6, 10.0)
 

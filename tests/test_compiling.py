@@ -93,6 +93,7 @@ def swept(count, y0):
     return jb.sweep(jb.presets.class_b, axes, y0=y0, t1=20.0 + count, observe="final")
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("name", SAME_PROGRAM)
 def test_numbers_decide_no_program(name):
     first, second = SAME_PROGRAM[name]

@@ -36,6 +36,7 @@ def fold(points):
     return jb.bifurcation_curve(points[0], (nu0, nu1), PLANE, step=0.02)
 
 
+@pytest.mark.slow(first=True)
 def test_the_hopf_curve_is_that_of_the_closed_form(points):
     curve = jb.bifurcation_curve(points[5], (nu0, nu1), PLANE, step=0.02)
     a, b = curve.values.T
@@ -558,6 +559,7 @@ def test_places_are_those_of_the_cycles_beside():
     assert known > len(curve) // 2 and np.ptp(curve.places[:, 2]) > 0.05
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("count", [1, 2, 11, 12])
 def test_a_curve_has_as_many_points_as_asked_for(points, count):
     curve = jb.bifurcation_curve(

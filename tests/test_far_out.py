@@ -7,6 +7,7 @@ import jaxbelt as jb
 from jaxbelt.model.far_out import contraction_far_out
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize(
     ("law", "damping", "expected", "start"),
     [

@@ -289,6 +289,7 @@ def test_an_edge_from_which_a_belt_carries_the_mass_and_back_is_met_at_once(earl
     assert float(run.events.t[0]) - t0 == pytest.approx(2 * (pi / 2 - t0), abs=1e-14, rel=1e-6)
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("speed", [1e-10, 1e-8, 1e-6])
 def test_an_edge_from_which_a_mass_slips_and_back_is_met_at_once(speed):
     belt = jb.Belt(jb.Oscillating(0.5, 0.25, 1.0), jb.Coulomb(0.5, 0.5), 1.0, lower=0.9)

@@ -38,6 +38,7 @@ def test_final_states_are_those_of_the_engine(swept):
             assert np.allclose([one.x1_end, one.x2_end], run.y_end, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow(first=True)
 def test_shift_by_a_period_changes_nothing(swept):
     period = 2 * np.pi / 1.7
     axes = {"amplitude": swept.amplitude.values, "frequency": np.array([1.7, 1.7, 1.7])}

@@ -861,6 +861,7 @@ def test_what_is_in_si_units_is_not_scaled_again():
         jb.in_si(once, machine)
 
 
+@pytest.mark.slow(first=True)
 def test_a_time_among_many_is_the_same_number():
     """Else the last of some times is behind the end of the run."""
     m = jb.Machine(0.5, 2000.0, 1.0, (jb.PhysicalBelt(0.02, jb.Coulomb(0.4, 0.3), 5.0),))

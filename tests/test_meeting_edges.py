@@ -264,6 +264,7 @@ def attractor(upper, y0):
     return engine.attractor(engine.Oscillator(0.5, belts), y0)
 
 
+@pytest.mark.slow(first=True)
 def test_an_orbit_that_settles_slowly():
     """Loops around both edges, of which each is by a hundredth nearer to the cycle."""
     cycle, seen = jb.find_cycle(beside(0.4004), (0.4, 0.1)), attractor(0.4004, (0.4, 0.1))

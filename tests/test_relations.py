@@ -296,6 +296,7 @@ def rests_on_an_edge(osc: jb.Oscillator, y0: np.ndarray) -> bool:
     return y0[1] == 0 and y0[0] in edges
 
 
+@pytest.mark.slow(first=True)
 @images_and_seeds
 def test_an_image_moves_as_it_does(image_of, seed):
     for number, (osc, y0) in enumerate(cases(seed)):

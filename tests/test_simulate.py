@@ -521,6 +521,7 @@ def test_an_edge_met_while_sticking_still_stuck():
     np.testing.assert_allclose(run.events.y[edge + 1], [1.2, 0.3], atol=1e-14)
 
 
+@pytest.mark.slow(first=True)
 def test_an_edge_met_while_sticking_torn_off():
     run = agree(*two_belts(0.3, -2.0, 0.9, np.inf), (-0.5, 0.3), span=15.0)
     assert run.events.kind[0] == EventKind.EDGE  # one event, though it ends the stick phase

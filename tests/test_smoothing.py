@@ -101,6 +101,7 @@ def end(formulation, osc, y0, t1, width=None, ts=None, t0=0.0):
 # --- states ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow(first=True)
 @pytest.mark.parametrize("formulation", WIDTHS)
 def test_a_narrow_interval_is_not_jumped(formulation):
     """The mass never comes near the belt's velocity 10, so both are the exact motion of a push of

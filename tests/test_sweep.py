@@ -64,6 +64,7 @@ def test_axes_of_starts_and_of_functions_with_fixed_arguments(dataset):
     np.testing.assert_allclose(starts.x1_end.sel(x1=3.0), expected, atol=1e-9)
 
 
+@pytest.mark.slow(first=True)
 def test_a_mass_at_rest_is_near_no_edge():
     # x1 = x2 = x2' = 0, between the intervals of two belts: no way is short against a speed of 0.
     law = jb.Conti(1.0, 0.6, 10.0)

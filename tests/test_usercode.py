@@ -128,6 +128,7 @@ def test_a_functional_whose_attribute_changed():
         assert float(functional(cycle)) == pytest.approx(wanted, abs=1e-8)
 
 
+@pytest.mark.slow(first=True)
 def test_programs_are_forgotten_only_where_something_changed(monkeypatch):
     monkeypatch.setitem(globals(), "residual", 0.8)
     end(Reading(1.0))
