@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import jaxbelt as jb
+from jaxbelt import interrupts
 from jaxbelt.numerics.spacing import evenly_spaced
 from jaxbelt.sweeps import clusters
 from jaxbelt.sweeps import store as stores
@@ -115,8 +116,12 @@ def test_killed_workers_cost_their_blocks_and_nothing_else(client, tmp_path, mon
 
 @pytest.mark.slow(first=True)
 @pytest.mark.usefixtures("hears_interrupts")
-def test_an_interrupt_leaves_the_workers_free(client, tmp_path):
-    """A block that would take minutes: its worker hears of the interrupt, too."""
+@pytest.mark.parametrize("is_only_noted", [False, True])
+def test_an_interrupt_leaves_the_workers_free(client, tmp_path, monkeypatch, is_only_noted):
+    """A block that would take minutes: its worker hears of the interrupt, too. An interrupt that
+    comes during an import is only noted, and raised afterwards."""
+    if is_only_noted:
+        monkeypatch.setattr(interrupts, "_imports", lambda frame: np.nan)
     axes = {"nu0": AXES["nu0"][:4], "nu1": [0.35]}
     # So long that the number of steps that a run may take is more than the kernel can count.
     options = dict(t1=1e7, observe=kills.Sum(), store=tmp_path / "a.zarr", progress=False)

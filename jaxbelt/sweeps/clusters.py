@@ -13,13 +13,14 @@ import pickle
 import time
 import uuid
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
 
 from ..checks import require_value
+from ..interrupts import heard_interrupts
 from ..numerics.widths import is_cpu
 from .question import Question
 from .store import Store
@@ -29,6 +30,8 @@ from .work import Advance, counts, do_runs
 RETRIES = 2
 #: How often a block is submitted again that Dask gave up, because several workers died with it.
 RESUBMISSIONS = 3
+#: Seconds between two looks for blocks that are done, and for interrupts.
+LOOK = 0.02
 #: Name of a Dask resource; where any worker has it, blocks go only to workers that have it.
 GPU = "GPU"
 
@@ -61,24 +64,35 @@ def do_on_cluster(client: Any, question: Question, store: Store, advance: Advanc
     futures = {submit(block): block for block in store.to_do}
     done = as_completed(futures)
     try:
-        for future in done:
-            block = futures.pop(future)
-            try:
-                outcome = future.result()
-            except KilledWorker:
-                if submitted[block] > RESUBMISSIONS:
-                    raise
-                again = submit(block)
-                futures[again] = block
-                done.add(again)
-                continue
-            store.read_rows(block)
-            if not store.is_done(block):
-                raise OSError(f"store {store.path} must be in a folder that all workers share")
-            advance(outcome["statuses"])
+        with heard_interrupts(at_once=True) as raise_interrupt:
+            for future in _in_turn(done, raise_interrupt):
+                block = futures.pop(future)
+                try:
+                    outcome = future.result()
+                except KilledWorker:
+                    if submitted[block] > RESUBMISSIONS:
+                        raise
+                    again = submit(block)
+                    futures[again] = block
+                    done.add(again)
+                    continue
+                store.read_rows(block)
+                if not store.is_done(block):
+                    raise OSError(f"store {store.path} must be in a folder that all workers share")
+                advance(outcome["statuses"])
     finally:
         client.cancel(list(futures))
         store.read_rows(*store.to_do)
+
+
+def _in_turn(done: Any, raise_interrupt: Callable[[], None]) -> Iterator[Any]:
+    """Futures as they complete; an interrupt that was only noted is raised in between."""
+    while not done.is_empty():
+        raise_interrupt()
+        if done.has_ready():
+            yield next(done)
+        else:
+            time.sleep(LOOK)
 
 
 def _resources(client: Any) -> dict[str, float] | None:
