@@ -75,9 +75,8 @@ def told(*given):
 threads._Team.compile = told
 app()
 """
-#: Seconds from the interrupt to the end of the process, on a machine that does other work, too: one
-#: second where it is quiet, and hours where the interrupt is lost.
-SOON = 10.0
+#: Seconds from the interrupt to the end of the process.
+SOON = 2.0
 
 
 def interrupted(

@@ -126,18 +126,20 @@ def _up_to_neighbours(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Values and curve at the rows of a stretch, and where it meets the stretches beside it: at the
     special value between their rows, else in the middle."""
-    x, y = values[rows], curve[rows]
-    for i, at in ((rows.start, 0), (rows.stop, len(x))):
+
+    def meeting(i: int) -> list[tuple[float, float]]:
+        """The point between the rows i - 1 and i, if there are both."""
         if not 0 < i < len(values):
-            continue
+            return []
         low, high = sorted(values[i - 1 : i + 1])
         between = special[(special > low) & (special < high)]
         value = between[0] if between.size else 0.5 * (low + high)
         share = (value - values[i - 1]) / (values[i] - values[i - 1]) if high > low else 0.5
-        x = np.insert(x, at if at == 0 else len(x), value)
-        height = curve[i - 1] + share * (curve[i] - curve[i - 1])
-        y = np.insert(y, at if at == 0 else len(y), height)
-    return x, y
+        return [(value, curve[i - 1] + share * (curve[i] - curve[i - 1]))]
+
+    own = zip(values[rows], curve[rows], strict=True)
+    x, y = zip(*meeting(rows.start), *own, *meeting(rows.stop), strict=True)
+    return np.array(x), np.array(y)
 
 
 #: Points drawn between two rows of a curve.
