@@ -117,7 +117,8 @@ def _name_of(functional: Any) -> str:
 
 def _stretches_of(flags: np.ndarray) -> list[slice]:
     """Slices of consecutive rows with equal flags."""
-    ends = [0, *(np.flatnonzero(flags[1:] != flags[:-1]) + 1), len(flags)]
+    changes = np.flatnonzero(flags[1:] != flags[:-1]) + 1
+    ends = [0, *changes.tolist(), len(flags)]
     return [slice(a, b) for a, b in pairwise(ends)]
 
 
