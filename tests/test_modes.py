@@ -259,31 +259,36 @@ ENGINES = {"simulate": by_simulate, "orbits": by_orbit, "sweep": by_sweep}
         pytest.param(False, id="alone", marks=pytest.mark.slow(first=True)),
     ],
 )
-@pytest.mark.parametrize("row", TABLE, ids=[row.name for row in TABLE])
-def test_transition(row: Row, beside: bool, engine: str):
-    osc = oscillator(row, beside)
-    more = (BELOW,) * (len(osc.belts) - len(row.belts))
-    seen = ENGINES[engine](osc, row.y, *((row, beside) if engine == "sweep" else ()))
-    assert seen == Seen((*row.mode, *more), row.event, (*row.after, *more))
+def test_transitions(beside: bool, engine: str):
+    """All rows in one test, as they share programs."""
+
+    def expected(row: Row) -> Seen:
+        more = (BELOW,) * (len(oscillator(row, beside).belts) - len(row.belts))
+        return Seen((*row.mode, *more), row.event, (*row.after, *more))
+
+    def seen(row: Row) -> Seen:
+        more = (row, beside) if engine == "sweep" else ()
+        return ENGINES[engine](oscillator(row, beside), row.y, *more)
+
+    assert {row.name: seen(row) for row in TABLE} == {row.name: expected(row) for row in TABLE}
 
 
-@pytest.mark.parametrize("name", RESTS)
-def test_rest(name: str):
-    """An end that is no event. An equilibrium is no end for a run of `simulate`: it stays."""
-    belts, y, mode, status = RESTS[name]
-    osc = Oscillator(0.0, belts)
-    run = jb.simulate(osc, y, LONG, max_segments=ARCS)
-    ends = status != Status.EQUILIBRIUM
-    assert run.status == (status if ends else Status.OK) and run.events.t.size == 0
-    np.testing.assert_allclose(run.ys, np.broadcast_to(y, run.ys.shape), atol=1e-15)
-    assert ints(run.arcs.mode[0]) == mode
+def test_rests():
+    """Ends that are no events. An equilibrium is no end for a run of `simulate`: it stays."""
+    for belts, y, mode, status in RESTS.values():
+        osc = Oscillator(0.0, belts)
+        run = jb.simulate(osc, y, LONG, max_segments=ARCS)
+        ends = status != Status.EQUILIBRIUM
+        assert run.status == (status if ends else Status.OK) and run.events.t.size == 0
+        np.testing.assert_allclose(run.ys, np.broadcast_to(y, run.ys.shape), atol=1e-15)
+        assert ints(run.arcs.mode[0]) == mode
 
-    assert jb.find_cycle(osc, y).status == status
+        assert jb.find_cycle(osc, y).status == status
 
-    found = lists.swept([osc], y0=y, t1=LONG, observe="attractor").squeeze()
-    kind = "stuck" if status == Status.STUCK_FOREVER else "equilibrium"
-    assert jb.decoded(found).kind == kind and found.n_events == 0
-    assert (found.x1_min, found.x1_max) == (y[0], y[0])
+        found = lists.swept([osc], y0=y, t1=LONG, observe="attractor").squeeze()
+        kind = "stuck" if status == Status.STUCK_FOREVER else "equilibrium"
+        assert jb.decoded(found).kind == kind and found.n_events == 0
+        assert (found.x1_min, found.x1_max) == (y[0], y[0])
 
 
 def test_a_loop_of_no_modes_has_no_events():
