@@ -19,6 +19,10 @@ from .tracks import Track
 #: Distances from a change of signature, in steps, at which the curve beyond it is searched for: it
 #: may bend sharply, or end near there.
 BESIDE_CHANGE = (0.5, 0.1, 0.02)
+#: Directions in which it is searched for, in degrees from straight on: it may have a corner there.
+TURNS = (0, 15, -15, 30, -30, 50, -50, 75, -75, 105, -105, 135, -135)
+#: A curve goes back where it came from within 45 degrees.
+BACK = 0.7
 #: A point is on a curve if it is no farther than this from the chords between rows, in steps:
 #: neighbouring tangents differ by 18 degrees at most.
 ON_CHORD = 0.05
@@ -102,67 +106,107 @@ def beyond_change(
     rows: list[CurveRow],
     last: np.ndarray,
     centre: np.ndarray,
+    way: np.ndarray,
 ) -> tuple[BifurcationPoint, np.ndarray] | None:
     """The point of the same condition just beyond a change of signature, and both its parameters.
 
     None if there is none. It has to be the same cycle, at about the same place. The curve may have
     a corner at the change, so the search goes all around it, except where the curve came from.
+
+    Args:
+        problem: The curve.
+        track: The track up to the change.
+        rows: The rows so far.
+        last: The unknowns at the last of them.
+        centre: Both parameters at the change.
+        way: Direction of the curve there, [2], where `last` is at the change itself.
     """
-    found = (
-        _near_change(problem, track, rows, last, centre, part * problem.step)
-        for part in BESIDE_CHANGE
-    )
-    return next((one for one in found if one is not None), None)
+    change = _Change(problem, track, rows, last, centre, way)
+    reaches = [part * problem.step for part in BESIDE_CHANGE]
+    guessed = (one for reach in reaches for one in change.from_guesses(reach))
+    # Where the motion exists only close to the curve, guesses miss it. A curve that goes on crosses
+    # a side of the largest square around the change.
+    searched = change.from_search(reaches[0])
+    return next(itertools.chain(guessed, searched), None)
 
 
-def _near_change(
-    problem: CurveProblem,
-    track: Track,
-    rows: list[CurveRow],
-    last: np.ndarray,
-    centre: np.ndarray,
-    reach: float,
-) -> tuple[BifurcationPoint, np.ndarray] | None:
-    """See `beyond_change`; reach: the distance from the change along one of the parameters."""
-    condition, before, place = problem.condition, last[-2:], track.place(last)
-    known = problem.variation.oscillator(before), track.system, track.unknowns(last)
-    came_from = (before - centre) / max(float(np.linalg.norm(before - centre)), 1e-12)
+class _Change(NamedTuple):
+    """A change of signature; the fields are the arguments of `beyond_change`."""
 
-    def direct(held: Variation, near: float) -> Iterator[BifurcationPoint | None]:
-        for offset in (-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0):
-            yield condition.named_point_beside(held, near + offset * reach, *known)
+    problem: CurveProblem
+    track: Track
+    rows: list[CurveRow]
+    last: np.ndarray
+    centre: np.ndarray
+    way: np.ndarray
 
-    def searched(held: Variation, near: float) -> Iterator[BifurcationPoint | None]:
-        # Where the motion exists only close to the curve, the direct guesses miss it. For a state
-        # of rest there are no other guesses.
-        if not has_clock(known[0]) and not isinstance(track.system, RestSystem):
-            yield from points_within(condition, held, near, 2 * reach)
+    def from_guesses(self, reach: float) -> Iterator[tuple[BifurcationPoint, np.ndarray]]:
+        """Points beyond that are found from guesses at the distance `reach`, those straight on
+        first."""
+        condition, variation = self.problem.condition, self.problem.variation
+        known = variation.oscillator(self.last[-2:]), self.track.system
+        unknowns = self.track.unknowns(self.last)
+        back = self._back()
+        straight = np.arctan2(*(-back if back.any() else self.way)[::-1])
+        for turn in straight + np.deg2rad(TURNS):
+            away = np.array([np.cos(turn), np.sin(turn)])
+            held = int(np.argmax(np.abs(away)))
+            guess = self.centre + reach * away / abs(away[held])
+            along = variation.held(held, float(guess[held]))
+            point = condition.named_point_beside(along, float(guess[1 - held]), *known, unknowns)
+            if point is not None and self._goes_on(point, held, guess, reach):
+                yield point, _moved(guess, held, point)
 
-    found: list[tuple[float, BifurcationPoint, np.ndarray]] = []
-    for way, free, side in itertools.product((direct, searched), (0, 1), (1.0, -1.0)):
-        if found and way is searched:
-            break
-        values = centre + side * reach * np.eye(2)[1 - free]
-        held = problem.variation.held(1 - free, float(values[1 - free]))
-        for point in way(held, float(values[free])):
-            if point is None or is_elsewhere(point.place, place, FAR):
-                continue
-            if point.condition.lineage != condition.lineage:
-                continue
-            at = values.copy()
-            at[free] = float(point.value)
-            inside = np.all((problem.limits[:, 0] <= at) & (at <= problem.limits[:, 1]))
-            away = at - centre
-            distance = float(np.linalg.norm(away))
-            if inside and 0 < distance < 6 * reach and (away / distance) @ came_from < 0.7:
-                found.append((distance, point, at))
-    curve = np.array([row.values for row in rows]), np.array([row.place for row in rows])
-    for _, point, at in sorted(found, key=lambda one: one[0]):
+    def from_search(self, reach: float) -> Iterator[tuple[BifurcationPoint, np.ndarray]]:
+        """Points beyond that the search of `scan` finds on the sides of a square around the change,
+        at the distance `reach`, the nearest first; none for states of rest and with forcing."""
+        if has_clock(self.problem.variation.oscillator(self.last[-2:])):
+            return
+        if isinstance(self.track.system, RestSystem):
+            return
+        found: list[tuple[float, BifurcationPoint, np.ndarray]] = []
+        for held, side in itertools.product((1, 0), (1.0, -1.0)):
+            on_side = self.centre + side * reach * np.eye(2)[held]
+            along = self.problem.variation.held(held, float(on_side[held]))
+            near = float(on_side[1 - held])
+            for point in points_within(self.problem.condition, along, near, 2 * reach):
+                if self._goes_on(point, held, on_side, reach):
+                    at = _moved(on_side, held, point)
+                    found.append((float(np.linalg.norm(at - self.centre)), point, at))
+        yield from (one[1:] for one in sorted(found, key=lambda one: one[0]))
+
+    def _back(self) -> np.ndarray:
+        """The direction from which the curve came, [2]; 0 where `last` is at the change."""
+        before = self.last[-2:] - self.centre
+        return before / max(float(np.linalg.norm(before)), 1e-12)
+
+    def _goes_on(self, point: BifurcationPoint, held: int, guess: np.ndarray, reach: float) -> bool:
+        """Whether a point is on the same curve beyond the change, and near; held: the parameter
+        that has its value of the guess there."""
+        problem, at = self.problem, _moved(guess, held, point)
+        away = at - self.centre
+        distance = float(np.linalg.norm(away))
+        is_near = np.all((problem.limits[:, 0] <= at) & (at <= problem.limits[:, 1]))
+        is_near = is_near and 0 < distance < 6 * reach
+        if not is_near or (away / distance) @ self._back() >= BACK:
+            return False
+        if point.condition.lineage != problem.condition.lineage:
+            return False
+        if is_elsewhere(point.place, self.track.place(self.last), FAR):
+            return False
+        values = np.array([row.values for row in self.rows])
+        places = np.array([row.place for row in self.rows])
+        if is_on_rows(at, point.place, values, places, ON_CHORD * problem.step):
+            return False
         system, _ = point.condition.applied_to(point.oscillator).system_at(point)
-        passed = is_on_rows(at, point.place, *curve, ON_CHORD * problem.step)
-        if not passed and not track.system.has_signature_of(system):
-            return point, at
-    return None
+        return not self.track.system.has_signature_of(system)
+
+
+def _moved(guess: np.ndarray, held: int, point: BifurcationPoint) -> np.ndarray:
+    """Both parameters of a point that was found from a guess with one of them held, [2]."""
+    at = guess.copy()
+    at[1 - held] = float(point.value)
+    return at
 
 
 def is_on_rows(

@@ -392,7 +392,8 @@ def _side(
         centre = np.array(changes[-1].values) if changes else known[-2:]
         rests = isinstance(track.system, RestSystem)
         is_end = problem.condition.ends_at_contact and (bool(changes) or rests)
-        further = None if is_end else beyond_change(problem, track, rows, last, centre)
+        way = (points[-1][0].tangent if points else direction)[-2:]
+        further = None if is_end else beyond_change(problem, track, rows, last, centre, way)
         if further is None and (rests or is_forced) and beyond is not None:
             at_end = [
                 one for one in leg.at_change if parameters_apart(one.values, known) < 2 * error
