@@ -45,6 +45,12 @@ def test_a_forced_mass_comes_to_rest_where_loops_shrink(case, rests):
         np.testing.assert_allclose(run.events.t[:60], loops.t[:60], rtol=0, atol=1e-6)
         return
     np.testing.assert_array_equal(run.ys[0], (EDGE, 0.0))
+    force, *numbers = case
+    swept = jb.sweep(
+        lambda force: osc(force, *numbers), {"force": [force]}, y0=(1.0, 0.3), t1=400.0
+    )
+    assert swept.status.item() == run.status and swept.n_events.item() == n
+    np.testing.assert_array_equal(swept.mode_end[0], run.modes[-1])
     np.testing.assert_allclose(run.events.t, loops.t[:n], rtol=0, atol=1e-7)
     speeds = np.abs(loops.y[n - 1 :, 1])
     # It goes up and down with the force by the cube root of how much both pushes vary, and shrinks.

@@ -123,11 +123,26 @@ def beyond_change(
     """
     change = _Change(problem, track, rows, last, centre, way)
     reaches = [part * problem.step for part in BESIDE_CHANGE]
-    guessed = (one for reach in reaches for one in change.from_guesses(reach))
     # Where the motion exists only close to the curve, guesses miss it. A curve that goes on crosses
     # a side of the largest square around the change.
-    searched = change.from_search(reaches[0])
-    return next(itertools.chain(guessed, searched), None)
+    ways = [*((change.from_guesses, reach) for reach in reaches), (change.from_search, reaches[0])]
+    found = (change.nearest(find(reach), reach) for find, reach in ways)
+    return next((one for one in found if one is not None), None)
+
+
+class _Beside(NamedTuple):
+    """A point beside a change: with the parameter `held` at its value in `guess`, both of them."""
+
+    point: BifurcationPoint
+    held: int
+    guess: np.ndarray
+
+    @property
+    def values(self) -> np.ndarray:
+        """Both parameters, [2]."""
+        at = self.guess.copy()
+        at[1 - self.held] = float(self.point.value)
+        return at
 
 
 class _Change(NamedTuple):
@@ -140,13 +155,11 @@ class _Change(NamedTuple):
     centre: np.ndarray
     way: np.ndarray
 
-    def from_guesses(self, reach: float) -> Iterator[tuple[BifurcationPoint, np.ndarray]]:
-        """Points beyond that are found from guesses at the distance `reach`, those straight on
-        first."""
+    def from_guesses(self, reach: float) -> Iterator[_Beside]:
+        """Points of the condition that are found from guesses at the distance `reach`."""
         condition, variation = self.problem.condition, self.problem.variation
         known = variation.oscillator(self.last[-2:]), self.track.system
-        unknowns = self.track.unknowns(self.last)
-        back = self._back()
+        unknowns, back = self.track.unknowns(self.last), self._back()
         straight = np.arctan2(*(-back if back.any() else self.way)[::-1])
         for turn in straight + np.deg2rad(TURNS):
             away = np.array([np.cos(turn), np.sin(turn)])
@@ -154,59 +167,56 @@ class _Change(NamedTuple):
             guess = self.centre + reach * away / abs(away[held])
             along = variation.held(held, float(guess[held]))
             point = condition.named_point_beside(along, float(guess[1 - held]), *known, unknowns)
-            if point is not None and self._goes_on(point, held, guess, reach):
-                yield point, _moved(guess, held, point)
+            if point is not None:
+                yield _Beside(point, held, guess)
 
-    def from_search(self, reach: float) -> Iterator[tuple[BifurcationPoint, np.ndarray]]:
-        """Points beyond that the search of `scan` finds on the sides of a square around the change,
-        at the distance `reach`, the nearest first; none for states of rest and with forcing."""
-        if has_clock(self.problem.variation.oscillator(self.last[-2:])):
+    def from_search(self, reach: float) -> Iterator[_Beside]:
+        """Points of the condition that the search of `scan` finds on the sides of a square around
+        the change, at the distance `reach`; none of states of rest and with forcing."""
+        condition, variation = self.problem.condition, self.problem.variation
+        forced = has_clock(variation.oscillator(self.last[-2:]))
+        if forced or isinstance(self.track.system, RestSystem):
             return
-        if isinstance(self.track.system, RestSystem):
-            return
-        found: list[tuple[float, BifurcationPoint, np.ndarray]] = []
         for held, side in itertools.product((1, 0), (1.0, -1.0)):
-            on_side = self.centre + side * reach * np.eye(2)[held]
-            along = self.problem.variation.held(held, float(on_side[held]))
-            near = float(on_side[1 - held])
-            for point in points_within(self.problem.condition, along, near, 2 * reach):
-                if self._goes_on(point, held, on_side, reach):
-                    at = _moved(on_side, held, point)
-                    found.append((float(np.linalg.norm(at - self.centre)), point, at))
-        yield from (one[1:] for one in sorted(found, key=lambda one: one[0]))
+            middle = self.centre + side * reach * np.eye(2)[held]
+            along = variation.held(held, float(middle[held]))
+            for point in points_within(condition, along, float(middle[1 - held]), 2 * reach):
+                yield _Beside(point, held, middle)
+
+    def nearest(
+        self, some: Iterable[_Beside], reach: float
+    ) -> tuple[BifurcationPoint, np.ndarray] | None:
+        """The nearest of some points that are on the curve beyond the change, and its parameters;
+        reach: about their distance."""
+        fits = [(one.values, one.point) for one in some if self._is_beyond(one, reach)]
+        fits.sort(key=lambda one: float(np.linalg.norm(one[0] - self.centre)))
+        return next(((point, at) for at, point in fits if self._is_new(point, at)), None)
 
     def _back(self) -> np.ndarray:
         """The direction from which the curve came, [2]; 0 where `last` is at the change."""
         before = self.last[-2:] - self.centre
         return before / max(float(np.linalg.norm(before)), 1e-12)
 
-    def _goes_on(self, point: BifurcationPoint, held: int, guess: np.ndarray, reach: float) -> bool:
-        """Whether a point is on the same curve beyond the change, and near; held: the parameter
-        that has its value of the guess there."""
-        problem, at = self.problem, _moved(guess, held, point)
+    def _is_beyond(self, one: _Beside, reach: float) -> bool:
+        """Whether a point is of the same kind of cycle, near, and not where the curve came from."""
+        (low, high), at = self.problem.limits.T, one.values
         away = at - self.centre
         distance = float(np.linalg.norm(away))
-        is_near = np.all((problem.limits[:, 0] <= at) & (at <= problem.limits[:, 1]))
-        is_near = is_near and 0 < distance < 6 * reach
-        if not is_near or (away / distance) @ self._back() >= BACK:
+        if not np.all((low <= at) & (at <= high)) or not 0 < distance < 6 * reach:
             return False
-        if point.condition.lineage != problem.condition.lineage:
+        if (away / distance) @ self._back() >= BACK:
             return False
-        if is_elsewhere(point.place, self.track.place(self.last), FAR):
-            return False
-        values = np.array([row.values for row in self.rows])
-        places = np.array([row.place for row in self.rows])
-        if is_on_rows(at, point.place, values, places, ON_CHORD * problem.step):
-            return False
+        is_alike = one.point.condition.lineage == self.problem.condition.lineage
+        return is_alike and not is_elsewhere(one.point.place, self.track.place(self.last), FAR)
+
+    def _is_new(self, point: BifurcationPoint, at: np.ndarray) -> bool:
+        """Whether a point is not on the curve so far, and its motion has another signature."""
+        curve = [
+            np.stack(column) for column in zip(*((row.values, row.place) for row in self.rows))
+        ]
+        passed = is_on_rows(at, point.place, curve[0], curve[1], ON_CHORD * self.problem.step)
         system, _ = point.condition.applied_to(point.oscillator).system_at(point)
-        return not self.track.system.has_signature_of(system)
-
-
-def _moved(guess: np.ndarray, held: int, point: BifurcationPoint) -> np.ndarray:
-    """Both parameters of a point that was found from a guess with one of them held, [2]."""
-    at = guess.copy()
-    at[1 - held] = float(point.value)
-    return at
+        return not passed and not self.track.system.has_signature_of(system)
 
 
 def is_on_rows(

@@ -116,7 +116,8 @@ def _through_guards(
         a=a,
         h=h,
         pace=jnp.where(fired, STEP_SAFETY / first_step(rtol), lanes.pace),
-        mode=mode,
+        # At a pseudo-focus the mass is in no mode; the mode before is reported.
+        mode=select(captured, lanes.mode, mode),
         events=lanes.events + jnp.where(happened, 1, 0).astype(lanes.events.dtype),
         status=status,
         done=captured,

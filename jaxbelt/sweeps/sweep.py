@@ -74,7 +74,8 @@ def sweep(
     `Status` code for each run. Categories, such as kind, are integers with the attributes
     flag_values and flag_meanings; `decoded` returns the words.
 
-    - `"final"`: x1_end, x2_end, mode_end(belt) (contact codes as in `Trajectory.modes`), n_events.
+    - `"final"`: x1_end, x2_end, mode_end(belt) (contact codes as in `Trajectory.modes`; at a
+      pseudo-focus those of the side from which the mass came), n_events.
     - `"attractor"`: kind (equilibrium, cycle, stuck, or undecided at t1), signature (the events of
       one loop, kind and belt), sticks(belt), period, stick_duration(belt) in a loop (inf where
       stuck for ever), x1_min, x1_max, x2_min, x2_max on the attractor, transient (the time at which
