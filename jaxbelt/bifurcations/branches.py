@@ -24,6 +24,7 @@ from ..cycles.periodic import (
     state_near_start,
 )
 from ..model.events import of_one_loop
+from ..model.friction import friction_jumps
 from ..model.own_units import OwnOscillator
 from ..results import Status
 from .base import AbstractCondition, BifurcationPoint
@@ -35,7 +36,6 @@ from .forced import (
     PeriodDoubling,
     SwitchingSliding,
     Torus,
-    friction_jumps,
 )
 from .forced_ends import borders_of
 from .legs import ForcedLine, MotionBranch, MotionLeg, MotionRow
@@ -507,7 +507,7 @@ def _jumps_at(point: BifurcationPoint) -> bool:
     holds, or lets go, for a time that is not short."""
     condition = point.condition
     may_jump = isinstance(condition, AddingSliding | GrazingSliding | SwitchingSliding)
-    return may_jump and friction_jumps(point.oscillator, int(condition.belt))
+    return may_jump and bool(friction_jumps(point.oscillator.belts[int(condition.belt)].friction))
 
 
 def _other_branches(line: ForcedLine, point: BifurcationPoint, begun: MotionRow) -> list[MotionRow]:

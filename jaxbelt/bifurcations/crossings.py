@@ -21,6 +21,7 @@ from ..checks import is_concrete
 from ..cycles.chains import SIZES, Chain, Loop, cut, first_failure
 from ..cycles.cycle import Cycle
 from ..cycles.shooting import meshed
+from ..model.friction import friction_jumps
 from ..model.modes import any_of, mode_of, select, velocity_of
 from ..model.oscillator import Belt, Oscillator
 from ..model.transitions import stick_limit
@@ -178,9 +179,8 @@ def _limit_met(cycle: Cycle, belt: int | Array) -> tuple[Array, Array]:
 
 
 def has_jump(belt: Belt) -> Array:
-    """Whether the static limit of a belt exceeds mu(0)."""
-    law = belt.friction
-    return belt.load * (law.static - law.mu(jnp.zeros(()))) > 0
+    """Whether the force at which a belt lets go exceeds its friction just after."""
+    return (belt.load != 0) & friction_jumps(belt.friction)
 
 
 # --- belts that change places ---------------------------------------------------------------------

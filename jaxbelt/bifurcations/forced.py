@@ -41,6 +41,7 @@ from ..cycles.periodic import (
     state_at_phase_0,
 )
 from ..cycles.reached import attracted, motions_of
+from ..model.friction import friction_jumps
 from ..model.instants import guards_trend
 from ..model.modes import STUCK, mode_of
 from ..model.oscillator import Oscillator, check_clock
@@ -60,7 +61,7 @@ TRIED = 4
 AT_ONSET = 1e-6
 #: Arcs whose durations differ by less than this part may be images of one another.
 ALIKE_ARCS = 0.1
-#: Jumps from static to kinetic friction, and their effects in own units, count as zero below this.
+#: Effects of jumps from static to kinetic friction, in own units, count as zero below this.
 SMALLEST_JUMP = 1e-6
 #: A point with a larger error, in units of the parameter, is solved again with integration steps
 #: that suit its own motion.
@@ -500,18 +501,12 @@ class AddingSliding(AbstractForcedCondition):
             if rows.codes[row, k] == STUCK:
                 cut = rows.cut(row, since, state, names.nearest_limit)
                 yield Beginning(cut, value, system(row, rows.codes[row]))
-        for row in range(len(rows.ends) - 1 if friction_jumps(osc, k) else 0):
+        for row in range(len(rows.ends) - 1 if friction_jumps(osc.belts[k].friction) else 0):
             here, after = rows.codes[row : row + 2]
             if rows.ends[row] == names.onset and here[k] == STUCK and abs(after[k]) == 1:
                 _, rate = _excess(osc, jnp.asarray(here), jnp.asarray(rows.z[row + 1, :3]))
                 touching = rows.ending(row, names.nearest_limit)
                 yield Beginning(touching, float(rate) ** 2, system(row, here))
-
-
-def friction_jumps(osc: Oscillator, belt: int) -> bool:
-    """Whether a belt's static friction is above its kinetic friction."""
-    law = osc.belts[belt].friction
-    return float(law.static - law.mu(jnp.zeros(()))) > SMALLEST_JUMP
 
 
 def without_one_of(

@@ -30,7 +30,7 @@ from jaxtyping import Array
 from ..checks import pick
 from ..model.equilibria import Equilibria, EquilibriumKind, side_pulls
 from ..model.far_out import contraction_far_out, is_bounded
-from ..model.friction import AbstractFriction
+from ..model.friction import AbstractFriction, friction_jumps
 from ..model.modes import edges
 from ..model.oscillator import Oscillator, constant_force
 from ..numerics.compiling import each, jit
@@ -145,8 +145,7 @@ class Returns:
         self.intervals = self._intervals_of_tops(rests)
         places = np.concatenate([*map(np.ravel, map(np.asarray, _positions(osc, rests)))])
         self._separating = np.concatenate([np.array(special), places])
-        laws = [belt.friction for belt in osc.belts]
-        self._holds_by_more = any(float(one.static) > float(one.mu(jnp.zeros(()))) for one in laws)
+        self._holds_by_more = any(bool(friction_jumps(belt.friction)) for belt in osc.belts)
         self._special = np.array([*special, *self._tops_after_sticking()])
         for low, high in self.intervals:
             self._search(low, high, rests)

@@ -84,6 +84,12 @@ class AbstractFriction(Parameters):
         return _of_static(self.static, self.mu(jnp.zeros(jnp.shape(self.static))))
 
 
+def friction_jumps(law: AbstractFriction) -> Array:
+    """Whether the static coefficient of a law exceeds mu(0) by more than rounding."""
+    static = jnp.asarray(law.static)
+    return static - law.mu(jnp.zeros(())) > MU_ROUNDING * (1 + static)
+
+
 def _of_static(static: ArrayLike, begins: ArrayLike) -> list[Rule]:
     """Rules of a law with this static coefficient and mu(0) = begins."""
     most = static + MU_ROUNDING * (1 + static)

@@ -207,14 +207,5 @@ def _distance(value, start, pair):
     return float(np.linalg.norm(at - a - part * way))
 
 
-def _is_beside(value, start, pair):
-    """Whether the value of a point lies between those of two rows, and its start is about as close
-    to theirs as they are to each other."""
-    before, after = pair[:2]
-    inside = min(before["value"], after["value"]) <= value <= max(before["value"], after["value"])
-    apart = np.max(np.abs(before["start"] - after["start"])) + 0.01
-    return inside and bool(np.max(np.abs(start - before["start"])) <= 2 * apart)
-
-
 def said(counts, largest) -> list[str]:
     return [f"{n} {name}" for name, n in sorted(counts.items())]

@@ -50,7 +50,6 @@ def _table(static, unit):
 _LAWS = {"conti": jb.Conti, "coulomb": jb.Coulomb, "stribeck": jb.Stribeck}
 _LAWS |= {"peak": _peak, "table": _table}
 _SIZES = {"conti": 4, "coulomb": 2, "stribeck": 3, "peak": 4, "table": 2}
-_KINDS = ("equilibrium", "cycle", "stuck")
 
 
 def oscillator(osc):
