@@ -35,7 +35,7 @@ ladder that shows it. Read from top to bottom, a module imports only what stands
     bifurcations/   special labels beside systems timed_systems guesses base conditions arc_rows
     bifurcations/   forced symmetry forced_edges tangencies crossings rests edge_rests edges folds
     bifurcations/   meetings connections infinity path scan refine tracks forced_ends changes curves
-    bifurcations/   cells faces bounds regions legs branches pieces diagrams switch_folds
+    bifurcations/   cells faces bounds regions legs branches pieces diagrams
     inverse/        selection record search windows witnesses fit margins design
     si              results in SI units
     plotting/       style histories phase forced points diagrams regions categories sweeps orbits

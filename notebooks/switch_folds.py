@@ -26,15 +26,14 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
-from ..checks import as_array, check_positive, require
-from ..cycles.shooting import flow
-from ..model.modes import Mode, capacity, mode_acceleration
-from ..model.oscillator import Oscillator
-from ..model.parameters import leaf_index, vary
-from ..numerics.compiling import jit
-from .base import BifurcationPoint
-from .systems import small_newton
-from .tangencies import NonsmoothFold
+from jaxbelt.bifurcations.base import BifurcationPoint
+from jaxbelt.bifurcations.systems import small_newton
+from jaxbelt.bifurcations.tangencies import NonsmoothFold
+from jaxbelt.checks import as_array, check_positive, require
+from jaxbelt.cycles.shooting import flow
+from jaxbelt.model.modes import Mode, capacity, mode_acceleration
+from jaxbelt.model.oscillator import Oscillator
+from jaxbelt.model.parameters import leaf_index, vary
 
 #: Integration steps of order twelve for the slip phase: with half as many folds move by 2e-12, with
 #: twice as many by 5e-15.
@@ -109,7 +108,7 @@ def _check(point):
     )
 
 
-@jit
+@eqx.filter_jit
 def _fold(point, index, v_star):
     # From a narrow band, where the asymptotic solution is good, by equal factors to the given one.
     bands = FIRST * (v_star / FIRST) ** jnp.linspace(0.0, 1.0, STAGES)
@@ -127,7 +126,7 @@ def _fold(point, index, v_star):
     return _where_found(u[3], v_star, residuals[-1])
 
 
-@jit
+@eqx.filter_jit
 def _band(point, index, value):
     def equations(given, u):
         point, value = given

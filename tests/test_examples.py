@@ -140,7 +140,8 @@ BY_DAY = ("01_first_steps", "02_sweeps", "06_atlas", "08_response")
         for path in NOTEBOOKS
     ],
 )
-def test_notebook_runs(path):
+def test_notebook_runs(path, monkeypatch):
+    monkeypatch.syspath_prepend(path.parent)  # as Jupyter does
     cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
     namespace = {}
     for cell in cells:

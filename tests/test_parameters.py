@@ -9,8 +9,8 @@ import pytest
 from laws import Lorentz
 
 import jaxbelt as jb
-from jaxbelt.bifurcations.switch_folds import switch_band, switch_fold
 from jaxbelt.model.parameters import leaf_groups, leaf_index, names_of, vary
+from notebooks.switch_folds import switch_band, switch_fold
 
 OSC = jb.presets.class_b(nu0=0.3, nu1=0.35)
 

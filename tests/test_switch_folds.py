@@ -9,7 +9,7 @@ from scipy.optimize import brentq, minimize_scalar
 from where import nu0
 
 import jaxbelt as jb
-from jaxbelt.bifurcations.switch_folds import switch_band, switch_fold
+from notebooks.switch_folds import switch_band, switch_fold
 
 
 @pytest.fixture(scope="module")
