@@ -73,6 +73,14 @@ def require_value(condition: Any, field: str, expected: str, value: Any) -> None
         require(False, field, expected, in_words(value))
 
 
+def check_key(key: Any) -> None:
+    """Raises a `ValueError` unless it is a key of JAX, of either sort."""
+    dtype, shape = getattr(key, "dtype", np.dtype(object)), np.shape(key)
+    typed = jnp.issubdtype(dtype, jax.dtypes.prng_key) and shape == ()
+    raw = dtype == np.uint32 and shape == (2,)
+    require_value(typed or raw, "key", "one key, such as jax.random.key(0)", key)
+
+
 #: Largest number of letters that describe a value in a message.
 LONGEST = 100
 

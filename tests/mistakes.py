@@ -476,6 +476,7 @@ MISTAKES = [
     ("jb.basin_fractions(osc, 'nu0', (0.1, 0.7), box=BOX, key=key)", SELECTS + ".*, got 'nu0'"),
     ("jb.basin_fractions(osc, nu0, (0.1, 0.7), box=(0, 1), key=key)", r"box must be .*\(0, 1\)"),
     ("jb.basin_fractions(osc, nu0, (0.1, 0.7), box=BOX, key=3)", "key must be one key, .* got 3"),
+    ("jb.lyapunov(forced, (1.0, 0.0), key=3)", "key must be one key, .* got 3"),
     (
         "jb.basin_fractions(osc, nu0, (0.1, 0.7), box=BOX, key=key, rows=1)",
         "rows must be an integer >= 2, got 1",

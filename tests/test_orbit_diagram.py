@@ -1,6 +1,7 @@
 """Orbit diagrams against the independent integrator, and zooming by the events of a mouse."""
 
 import dataclasses
+import pickle
 from types import SimpleNamespace
 
 import numpy as np
@@ -28,6 +29,12 @@ def height(osc, x1, x2):
 def diagram():
     starts = [(3.0, 0.0), (1.362, 0.0)]
     return jb.orbit_diagram(jb.presets.class_b(0.3, NU1), nu0, (-0.5, 0.45), y0=starts, rows=3)
+
+
+def test_a_diagram_of_a_parameter_can_be_pickled(diagram):
+    again = pickle.loads(pickle.dumps(diagram))
+    np.testing.assert_array_equal(again.values, diagram.values)
+    assert repr(again) == repr(diagram)
 
 
 def zeros(run, value, first, last):

@@ -584,3 +584,30 @@ def test_a_hopf_point_on_an_edge_explains_the_loss_of_its_small_cycle():
     points = jb.scan(with_an_edge_at_its_fixed_point, span=(0.05, 0.06), resolution=6)
     assert [(point.kind, point.type) for point in points] == [("Hopf", "degenerate")]
     assert float(points[0].value) == pytest.approx(HOPF, abs=1e-14)
+
+
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("damping", [0.1, 0.1001])
+@pytest.mark.parametrize("has_another", [False, True])
+def test_a_rest_that_vanishes_where_it_would_change_its_stability_has_both_points(
+    damping, has_another
+):
+    """x1 = mu(v) = 1/2 + exp(-2v)/2 is at the edge 0.55 where exp(-2v) = 0.1, and mu'(v) = -zeta
+    where exp(-2v) = zeta."""
+    law = jb.Stribeck(1.0, 0.5, 0.5)
+    belts = [jb.Belt(1.15, law, lower=0.55)]
+    if has_another:
+        belts += [jb.Belt(0.6, jb.Coulomb(0.5, 0.4), 0.5, upper=0.2)]
+    osc = jb.Oscillator(damping, tuple(belts))
+    for span in ((1.145, 1.155), (0.9, 1.4)):
+        points = [p for p in jb.scan(osc, nu0, span) if isinstance(p.condition, SEEN)]
+        assert sorted(str(point.condition) for point in points) == [
+            "BoundaryEquilibrium(belt=0)",
+            "Hopf()",
+        ]
+        for point in points:
+            at = -0.5 * np.log(damping if point.kind == "Hopf" else 0.1)
+            assert float(point.value) == pytest.approx(at, abs=1e-13)
+
+
+SEEN = (jb.Hopf, jb.BoundaryEquilibrium)

@@ -18,11 +18,13 @@ from .tracks import Track
 
 #: Distances from a change of signature, in steps, at which the curve beyond it is searched for: it
 #: may bend sharply, or end near there.
-BESIDE_CHANGE = (0.5, 0.1, 0.02)
+BESIDE_CHANGE = (0.02, 0.1, 0.5)
 #: Directions in which it is searched for, in degrees from straight on: it may have a corner there.
 TURNS = (0, 15, -15, 30, -30, 50, -50, 75, -75, 105, -105, 135, -135)
 #: A curve goes back where it came from within 45 degrees.
 BACK = 0.7
+#: Arcs are the same ones if their durations change by less than this part of them all.
+ALIKE_DURATIONS = 0.1
 #: A point is on a curve if it is no farther than this from the chords between rows, in steps:
 #: neighbouring tangents differ by 18 degrees at most.
 ON_CHORD = 0.05
@@ -121,11 +123,11 @@ def beyond_change(
         centre: Both parameters at the change.
         way: Direction of the curve there, [2], where `last` is at the change itself.
     """
-    change = _Change(problem, track, rows, last, centre, way)
+    change = _SignatureChange(problem, track, rows, last, centre, way)
     reaches = [part * problem.step for part in BESIDE_CHANGE]
     # Where the motion exists only close to the curve, guesses miss it. A curve that goes on crosses
     # a side of the largest square around the change.
-    ways = [*((change.from_guesses, reach) for reach in reaches), (change.from_search, reaches[0])]
+    ways = [*((change.from_guesses, reach) for reach in reaches), (change.from_search, reaches[-1])]
     found = (change.nearest(find(reach), reach) for find, reach in ways)
     return next((one for one in found if one is not None), None)
 
@@ -145,7 +147,7 @@ class _Beside(NamedTuple):
         return at
 
 
-class _Change(NamedTuple):
+class _SignatureChange(NamedTuple):
     """A change of signature; the fields are the arguments of `beyond_change`."""
 
     problem: CurveProblem
@@ -215,8 +217,17 @@ class _Change(NamedTuple):
             np.stack(column) for column in zip(*((row.values, row.place) for row in self.rows))
         ]
         passed = is_on_rows(at, point.place, curve[0], curve[1], ON_CHORD * self.problem.step)
-        system, _ = point.condition.applied_to(point.oscillator).system_at(point)
-        return not passed and not self.track.system.has_signature_of(system)
+        system, x = point.condition.applied_to(point.oscillator).system_at(point)
+        is_same = self.track.system.has_signature_of(system)
+        return not passed and not (is_same and self._begins_alike(np.asarray(x)))
+
+    def _begins_alike(self, x: np.ndarray) -> bool:
+        """Whether the arcs of a motion with the same signature, unknowns x, are those before the
+        change. With forcing its only event may have passed the phase 0, where the arcs begin."""
+        if not has_clock(self.problem.variation.oscillator(self.last[-2:])):
+            return True
+        durations, before = x[:, 3], np.asarray(self.track.unknowns(self.last))[:, 3]
+        return bool(np.max(np.abs(durations - before)) < ALIKE_DURATIONS * np.sum(before))
 
 
 def is_on_rows(

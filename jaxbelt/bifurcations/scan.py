@@ -48,7 +48,7 @@ from .folds import FoldOfCycles
 from .infinity import HopfAtInfinity
 from .meetings import EdgeExchange, MeetingEdges
 from .path import ROOM, ParameterPath
-from .rests import ANY, BeltAtRest, Hopf, SuddenSliding
+from .rests import ANY, AbstractRestCondition, BeltAtRest, Hopf, SuddenSliding
 from .tangencies import GrazingSliding
 
 #: Kinds that are searched; first those that are likelier and whose programs compile sooner.
@@ -407,14 +407,15 @@ def _possible_kinds(path: ParameterPath, a: float, b: float) -> list[AbstractCon
 def _beside_it(
     path: ParameterPath, a: float, b: float, point: BifurcationPoint
 ) -> list[BifurcationPoint]:
-    """Points of the same kind for other belts, or other motions, at the value of a point.
-
-    With a symmetry several such points coincide.
-    """
+    """Other points at the value of a point: of the same kind for other belts, or other motions, as
+    several coincide where there is a symmetry; and what makes a state of rest begin or cease to be,
+    which a change of its stability does not."""
     sought = point.condition.sought
     found = [point]
+    ceases = len(path.label(a).equilibria) != len(path.label(b).equilibria)
     for condition in _possible_kinds(path, a, b):
-        if type(condition.sought) is type(sought):
+        is_of_rest = ceases and isinstance(condition, AbstractRestCondition)
+        if is_of_rest or type(condition.sought) is type(sought):
             for one in _all_found(path, a, b, condition):
                 if is_at_one_value(one, point) and all(_is_apart(one, other) for other in found):
                     found.append(one)

@@ -137,13 +137,13 @@ def _counted_ends(osc: Oscillator, codes: Array, entries: Array, durations: Arra
 
 
 def timed_mesh(osc: Oscillator, size: int, codes: Array, y: Array, duration: Array) -> Array:
-    """Steps as fractions of the duration of a slip arc, [size]: as many as it needs, and zeros."""
+    """Steps as fractions of the duration of a slip arc, [size]: all of them, as a short arc may have
+    become long before there are new ones."""
     n = PLACING * size
     slips = ~mode_of(codes).any_stuck & (duration > 0)
     rho = densities(osc, n, codes, y, duration, slips)
     share = jnp.concatenate([jnp.zeros(1), jnp.cumsum(0.5 * (rho[1:] + rho[:-1]))])
-    count = jnp.clip(jnp.ceil(duration * share[-1] / n / TIMED_STRIDE), 1, size)
-    places = jnp.minimum(jnp.arange(size + 1.0) / count, 1.0)
+    places = jnp.linspace(0, 1, size + 1)
     grid = jnp.interp(places, share / share[-1], jnp.linspace(0, 1, n + 1))
     return jnp.where(slips, jnp.diff(grid), jnp.where(jnp.arange(size) == 0, 1.0, 0.0))
 

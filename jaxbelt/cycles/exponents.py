@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from ..activity import announced
-from ..checks import as_finite, as_whole, is_concrete, number, outside_of_traces
+from ..checks import as_finite, as_whole, check_key, is_concrete, number, outside_of_traces
 from ..model.modes import STUCK
 from ..model.oscillator import Oscillator, check_clock, check_oscillator
 from ..model.own_units import in_own_units
@@ -132,6 +132,8 @@ def lyapunov(
     y0 = as_finite(y0, "y0", (2,))
     periods = as_whole(periods, "periods", BLOCKS)
     transient = as_whole(transient, "transient", 0)
+    if key is not None:
+        check_key(key)
     own, turns = in_own_units(osc), turns_of(osc)
     length = 1.0 if own is osc else own.units.length
     y, skipped, passed = np.asarray(y0) / np.asarray(length), 0, 0

@@ -23,6 +23,7 @@ from ..checks import (
     as_interval,
     as_positive,
     as_whole,
+    check_key,
     check_no_start,
     outside_of_traces,
     refuse_interval,
@@ -522,14 +523,6 @@ def starts_in(corners: np.ndarray, n: int, key: Array) -> np.ndarray:
     """Starts drawn uniformly from a box, [2, n]."""
     low, high = corners[:, :1], corners[:, 1:]
     return np.asarray(jax.random.uniform(key, (2, n), minval=low, maxval=high))
-
-
-def check_key(key: Any) -> None:
-    """Raises a `ValueError` unless it is a key of JAX, of either sort."""
-    dtype, shape = getattr(key, "dtype", np.dtype(object)), np.shape(key)
-    typed = jnp.issubdtype(dtype, jax.dtypes.prng_key) and shape == ()
-    raw = dtype == np.uint32 and shape == (2,)
-    require_value(typed or raw, "key", "one key, such as jax.random.key(0)", key)
 
 
 def _kinds(osc: Oscillator, starts: np.ndarray, **numbers: Any) -> np.ndarray:

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from ..activity import announced, note_progress
-from ..checks import as_positive, as_whole, outside_of_traces
+from ..checks import as_positive, as_whole, check_key, outside_of_traces
 from ..cycles.attractors import MAYBE_SAME, Runs, distance, error_of_runs, place_of
 from ..cycles.cycle import cycle_from
 from ..dimensions import EXTENT
@@ -31,7 +31,7 @@ from ..numerics.spacing import evenly_spaced
 from ..results import Status, draw
 from ..tables import table_of
 from .attractor import CYCLE, EQUILIBRIUM, KINDS, STUCK_FOR_EVER, UNDECIDED, Attractor
-from .basins import as_box, check_key, rest_reached, standard_error, starts_in
+from .basins import as_box, rest_reached, standard_error, starts_in
 from .grid import Grid
 from .question import LONG_ENOUGH, settings_of_runs
 from .shares import numbers_of_attractors
