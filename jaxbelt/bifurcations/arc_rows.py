@@ -2,11 +2,13 @@
 
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from ..cycles.chains import Loop, padded_loop
 from ..cycles.periodic import PeriodicMotion
+from ..motion.arcs import Ends
 
 
 class ArcRows(NamedTuple):
@@ -57,6 +59,45 @@ class ArcRows(NamedTuple):
         first = (codes, end, np.append(last[:3], last[3] + half))
         second = (codes, self.ends[row + 1], np.append(middle, then[3] + half))
         return self.put(row - 1, row + 1, first, second)
+
+    def begun_at(
+        self, phase: float, states: np.ndarray, period: float
+    ) -> tuple["ArcRows", dict[int, int]]:
+        """The arcs of the same motion, which begin at another phase, a fraction of a period; and
+        the new rows of those that end in an event.
+
+        states: those in which the arcs pass that phase, [arcs, 2], NaN of arcs that do not.
+        """
+        begins, whole = np.cumsum(self.z[:, 3]) - self.z[:, 3], np.sum(self.z[:, 3])
+        end = Ends(self.codes.shape[1]).period
+        first = 0.0 if self.share is None else float(self.share)
+        t = period * (phase + (phase < first))
+        # Passages of the phase, and events: time, state and codes from there on, end, row.
+        passages = [
+            (begins[i] + t - self.z[i, 2], states[i], self.codes[i], end, i)
+            for i in np.flatnonzero(np.isfinite(states[:, 0])).tolist()
+        ]
+        events = [
+            (begins[i] + self.z[i, 3], self.z[then, :2], self.codes[then], self.ends[i], i)
+            for i in np.flatnonzero(self.ends != end).tolist()
+            for then in [(i + 1) % len(self.ends)]
+        ]
+        start = min(one[0] for one in passages)
+        order: list[tuple[Any, ...]] = [
+            ((one[0] - start) % whole, *one[1:]) for one in (*passages, *events)
+        ]
+        order.sort(key=lambda one: one[0])
+        rows, places, since = [], {}, 0.0
+        for place, (at, state, codes, kind, _) in enumerate(order):
+            then, _, _, ended_by, row = order[(place + 1) % len(order)]
+            since = at if kind == end else since
+            rows.append(
+                (codes, ended_by, [*state, phase * period + at - since, (then - at) % whole])
+            )
+            if ended_by != end:
+                places[row] = place
+        parts = [np.array(list(column)) for column in zip(*rows, strict=True)]
+        return ArcRows(*parts, share=jnp.asarray(phase)), places
 
     def loop(self) -> Loop:
         return padded_loop(self.codes, self.ends, self.z[:, :3], self.z[:, 3])

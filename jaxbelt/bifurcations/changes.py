@@ -5,15 +5,22 @@ import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
+from ..cycles.clocked import forcing_period, timed_chain_of
+from ..cycles.periodic import passing_states, phase_off_events
 from ..model.oscillator import has_clock
 from ..model.variations import Variation
-from ..numerics.continuation import CurvePoint
+from ..motion.arcs import Ends
+from ..numerics.continuation import CurvePoint, continue_curve
+from .arc_rows import ArcRows
 from .base import AbstractCondition, BifurcationPoint
 from .refine import points_within
 from .special import FAR, SpecialPoint, is_elsewhere
 from .systems import RestSystem, Seen
+from .timed_systems import TimedSystem
 from .tracks import Track
 
 #: Distances from a change of signature, in steps, at which the curve beyond it is searched for: it
@@ -23,8 +30,9 @@ BESIDE_CHANGE = (0.02, 0.1, 0.5)
 TURNS = (0, 15, -15, 30, -30, 50, -50, 75, -75, 105, -105, 135, -135)
 #: A curve goes back where it came from within 45 degrees.
 BACK = 0.7
-#: Arcs are the same ones if their durations change by less than this part of them all.
-ALIKE_DURATIONS = 0.1
+#: A point is on the curve behind a change if its own curve comes as near to the change as this, in
+#: steps, on a way that is followed in parts of the distance.
+AT_CHANGE, PARTS_TO_CHANGE, MOST_PARTS = 0.03, 4, 40
 #: A point is on a curve if it is no farther than this from the chords between rows, in steps:
 #: neighbouring tangents differ by 18 degrees at most.
 ON_CHORD = 0.05
@@ -76,6 +84,42 @@ def where_it_ends(track: Track, last: CurvePoint, beyond: CurvePoint) -> tuple[n
     return track.corrected(last.u, last.tangent, known * length).u, (ends - known) * length
 
 
+def begun_off_events_at(
+    track: Track, last: CurvePoint, beyond: CurvePoint
+) -> tuple[Track, np.ndarray, np.ndarray] | None:
+    """The track with arcs that begin off all events, if an event passes the phase at which they
+    begin between two of its points; u at the first one, and the direction from there on.
+
+    None where something else happens between them.
+    """
+    system, osc = track.system, track.variation.oscillator(last.u[-2:])
+    if not isinstance(system, TimedSystem):
+        return None
+    used, end = np.asarray(system.chain.used), Ends(len(osc.belts)).period
+    is_end = np.asarray(system.chain.ends)[used] == end
+    gone = track.unknowns(beyond.u)[used, 3] < 0
+    if not gone.any() or not np.all((is_end | np.roll(is_end, 1))[gone]):
+        return None
+    motion = system.motion(osc, track.unknowns(last.u))
+    phase = phase_off_events(osc, motion)
+    if phase is None:
+        return None
+    states = np.asarray(passing_states(osc, system.chain, motion.unknowns, jnp.asarray(phase)))
+    period, turns = float(forcing_period(osc, system.chain.turns)), system.chain.turns
+    rows, places = ArcRows.of(motion).begun_at(phase, states[used], period)
+    chain, z = timed_chain_of(osc, rows.loop(), turns, rows.share)
+    system = eqx.tree_at(lambda s: s.chain, system, chain)
+    if hasattr(system, "row"):
+        row = jnp.asarray(places[int(system.row)], dtype=jnp.asarray(system.row).dtype)
+        system = eqx.tree_at(lambda s: s.row, system, row)
+    system = system.refined(osc, z)
+    weights = system.weights(z)
+    begun = Track(track.variation, system, weights)
+    u = np.append(np.asarray(weights) * np.asarray(z).reshape(-1), last.u[-2:])
+    way = begun.tangent(u)
+    return begun, u, way * np.sign(way[-2:] @ last.tangent[-2:])
+
+
 def parameters_apart(values: Sequence[float] | np.ndarray, u: np.ndarray) -> float:
     """Distance of both parameters from those in the unknowns u of a curve."""
     return float(np.hypot(*np.subtract(values, u[-2:])))
@@ -100,6 +144,26 @@ def just_ahead(seen: list[tuple[CurvePoint, Seen]], step: float) -> list[Special
             at = last.u[-2:] + part * (last.u - before.u)[-2:]
             found.append(SpecialPoint(*name, (float(at[0]), float(at[1])), float(away)))
     return sorted(found, key=lambda point: point.residual)[:1]
+
+
+def begun_again(
+    problem: CurveProblem, track: Track, at: CurvePoint
+) -> tuple[Track, np.ndarray, np.ndarray] | None:
+    """The track that follows the same curve with the arcs that the motion has at a point, u there,
+    and the direction; None where the point is not found with these arcs."""
+    osc, values, way = problem.variation.oscillator(at.u[-2:]), at.u[-2:], at.tangent[-2:]
+    held = int(np.argmax(np.abs(way)))
+    along = problem.variation.held(held, float(values[held]))
+    known = osc, track.system, track.unknowns(at.u)
+    point = problem.condition.named_point_beside(along, float(values[1 - held]), *known)
+    if point is None or point.condition.lineage != problem.condition.lineage:
+        return None
+    away = abs(float(point.value) - values[1 - held])
+    if away > SAME_POINT_AGAIN or is_elsewhere(point.place, track.place(at.u), FAR):
+        return None
+    new, u = Track.begun(problem.variation, point, values)
+    direction = new.tangent(u)
+    return new, u, direction * np.sign(direction[-2:] @ way)
 
 
 def beyond_change(
@@ -217,17 +281,34 @@ class _SignatureChange(NamedTuple):
             np.stack(column) for column in zip(*((row.values, row.place) for row in self.rows))
         ]
         passed = is_on_rows(at, point.place, curve[0], curve[1], ON_CHORD * self.problem.step)
-        system, x = point.condition.applied_to(point.oscillator).system_at(point)
-        is_same = self.track.system.has_signature_of(system)
-        return not passed and not (is_same and self._begins_alike(np.asarray(x)))
+        system, _ = point.condition.applied_to(point.oscillator).system_at(point)
+        new = not passed and not self.track.system.has_signature_of(system)
+        return new and self._comes_from_change(point, at)
 
-    def _begins_alike(self, x: np.ndarray) -> bool:
-        """Whether the arcs of a motion with the same signature, unknowns x, are those before the
-        change. With forcing its only event may have passed the phase 0, where the arcs begin."""
-        if not has_clock(self.problem.variation.oscillator(self.last[-2:])):
+    def _comes_from_change(self, point: BifurcationPoint, at: np.ndarray) -> bool:
+        """Whether the curve of a point, followed backwards, comes from the change: others may pass
+        by."""
+        near = AT_CHANGE * self.problem.step
+        distance = float(np.linalg.norm(at - self.centre))
+        if distance <= near:
             return True
-        durations, before = x[:, 3], np.asarray(self.track.unknowns(self.last))[:, 3]
-        return bool(np.max(np.abs(durations - before)) < ALIKE_DURATIONS * np.sum(before))
+        track, u = Track.begun(self.problem.variation, point, at)
+        way = track.tangent(u)
+        step, path, nearest = distance / PARTS_TO_CHANGE, [at], distance
+        for one in continue_curve(
+            track.corrected,
+            u,
+            way * np.sign(way[-2:] @ (self.centre - at)),
+            step=step,
+            min_step=min(1e-3 * self.problem.step, step),
+            max_step=step,
+            max_points=MOST_PARTS,
+        ):
+            path.append(one.u[-2:])
+            nearest = min(nearest, float(np.min(from_chords(self.centre, np.stack(path[-2:]))[0])))
+            if nearest <= near or np.linalg.norm(path[-1] - self.centre) > 2 * distance:
+                break
+        return nearest <= near
 
 
 def is_on_rows(

@@ -40,6 +40,8 @@ from .changes import (
     SAME_POINT_AGAIN,
     CurveProblem,
     CurveRow,
+    begun_again,
+    begun_off_events_at,
     beyond_change,
     just_ahead,
     named_once,
@@ -50,7 +52,6 @@ from .forced import AbstractForcedCondition, UnitCircle
 from .forced_ends import border_at, meeting_point
 from .special import (
     CREEPS,
-    FAR,
     SpecialPoint,
     Trail,
     is_elsewhere,
@@ -343,7 +344,7 @@ def _side(
     rows: list[CurveRow] = []
     seen_last: list[tuple[CurvePoint, Seen]] = []
     special: list[SpecialPoint] = []
-    is_forced = isinstance(problem.condition, AbstractForcedCondition)
+    is_forced, has_turned = isinstance(problem.condition, AbstractForcedCondition), False
     while True:
         note_progress(f"{len(rows)} points on one side")
         most = min(REMESH, problem.max_points - max(len(rows) - 1, 0))
@@ -355,6 +356,13 @@ def _side(
         special = [*passed, *leg.at_change]
         seen_last = [*seen_last, *points[min(len(seen_last), 1) :]][-2:]
         last = points[-1][0].u if points else u
+        turned = None
+        if beyond is not None and points and not (has_turned and len(points) == 1):
+            turned = begun_off_events_at(track, points[-1][0], beyond)
+        has_turned = turned is not None
+        if turned is not None:
+            (track, u, direction), special = turned, passed
+            continue
         if not rows:
             return _OneSide(rows, special, end)
         trail = _trail(problem, track, rows, last, end)
@@ -382,7 +390,7 @@ def _side(
         elif beyond is None:
             # The same curve goes on with a new mesh, or with arcs that end where x2 is extreme.
             at, seen = points[-1]
-            begun = None if seen.is_cut else _begun_again(problem, track, at)
+            begun = None if seen.is_cut else begun_again(problem, track, at)
             track, u, direction = begun or track.remeshed(last, at.tangent)
             continue
         # The signature changes here, or between the last two points.
@@ -408,26 +416,6 @@ def _side(
         direction = direction * np.sign(direction[-2:] @ (u[-2:] - centre))
         rows.append(_row_at(problem, track, u, track.seen_at(u)))
         seen_last = []
-
-
-def _begun_again(
-    problem: CurveProblem, track: Track, at: CurvePoint
-) -> tuple[Track, np.ndarray, np.ndarray] | None:
-    """The track that follows the same curve with the arcs that the motion has at a point, u there,
-    and the direction; None where the point is not found with these arcs."""
-    osc, values, way = problem.variation.oscillator(at.u[-2:]), at.u[-2:], at.tangent[-2:]
-    held = int(np.argmax(np.abs(way)))
-    along = problem.variation.held(held, float(values[held]))
-    known = osc, track.system, track.unknowns(at.u)
-    point = problem.condition.named_point_beside(along, float(values[1 - held]), *known)
-    if point is None or point.condition.lineage != problem.condition.lineage:
-        return None
-    away = abs(float(point.value) - values[1 - held])
-    if away > SAME_POINT_AGAIN or is_elsewhere(point.place, track.place(at.u), FAR):
-        return None
-    new, u = Track.begun(problem.variation, point, values)
-    direction = new.tangent(u)
-    return new, u, direction * np.sign(direction[-2:] @ way)
 
 
 def _ended(

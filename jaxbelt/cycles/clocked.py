@@ -137,8 +137,8 @@ def _counted_ends(osc: Oscillator, codes: Array, entries: Array, durations: Arra
 
 
 def timed_mesh(osc: Oscillator, size: int, codes: Array, y: Array, duration: Array) -> Array:
-    """Steps as fractions of the duration of a slip arc, [size]: all of them, as a short arc may have
-    become long before there are new ones."""
+    """Steps as fractions of the duration of a slip arc, [size]: all of them, as a short arc may
+    have become long before there are new ones."""
     n = PLACING * size
     slips = ~mode_of(codes).any_stuck & (duration > 0)
     rho = densities(osc, n, codes, y, duration, slips)

@@ -262,7 +262,7 @@ _extrema = jit(extrema_along)
 
 def _at_phase_0(motion: PeriodicMotion) -> Array:
     """The states of the arcs of a motion, or of each of a batch, at the phase 0, [..., arcs, 2]."""
-    function = _passing_states
+    function = passing_states
     for _ in range(motion.unknowns.ndim - 2):
         function = jax.vmap(function, in_axes=(0, 0, 0, None))
     return function(motion.oscillator, motion.chain, motion.unknowns, jnp.zeros(()))
@@ -360,19 +360,9 @@ def begun_off_events(osc: Oscillator, motion: PeriodicMotion) -> PeriodicMotion:
     The motion is returned unchanged where that is hardly farther from events, or where the orbit
     from there leads to another motion. osc: its oscillator, concrete, in own units.
     """
-    chain, z = motion.chain, np.asarray(motion.unknowns)
-    period = float(forcing_period(osc, chain.turns))
-    ends = np.asarray(chain.ends)[np.asarray(chain.used)]
-    is_event = np.roll(ends != Ends(len(osc.belts)).period, 1)
-    phases = np.sort(z[: len(ends)][is_event, 2] / period % 1.0)
-    if int(motion.status) != Status.OK or not phases.size:
-        return motion
-    gaps = np.diff(phases, append=phases[0] + 1)
-    widest = int(np.argmax(gaps))
-    share = (phases[widest] + 0.5 * gaps[widest]) % 1.0
-    begins = 0.0 if chain.share is None else float(chain.share)
-    off = np.abs(phases - begins)
-    if np.min(np.minimum(off, 1 - off)) >= OFF_EVENTS * gaps[widest]:
+    chain = motion.chain
+    share = phase_off_events(osc, motion) if int(motion.status) == Status.OK else None
+    if share is None:
         return motion
     state = state_near_start(osc, motion, share, before=True)
     followed = arcs_over(osc, state, chain.turns, share)
@@ -384,13 +374,32 @@ def begun_off_events(osc: Oscillator, motion: PeriodicMotion) -> PeriodicMotion:
     return found if same else motion
 
 
+def phase_off_events(osc: Oscillator, motion: PeriodicMotion) -> float | None:
+    """The middle of the longest time between any two phases with events, a fraction of a period;
+    None without events, and where the chain begins hardly nearer to one."""
+    chain, z = motion.chain, np.asarray(motion.unknowns)
+    period = float(forcing_period(osc, chain.turns))
+    ends = np.asarray(chain.ends)[np.asarray(chain.used)]
+    is_event = np.roll(ends != Ends(len(osc.belts)).period, 1)
+    phases = np.sort(z[: len(ends)][is_event, 2] / period % 1.0)
+    if not phases.size:
+        return None
+    gaps = np.diff(phases, append=phases[0] + 1)
+    widest = int(np.argmax(gaps))
+    begins = 0.0 if chain.share is None else float(chain.share)
+    off = np.abs(phases - begins)
+    if np.min(np.minimum(off, 1 - off)) >= OFF_EVENTS * gaps[widest]:
+        return None
+    return float((phases[widest] + 0.5 * gaps[widest]) % 1.0)
+
+
 def state_near_start(
     osc: Oscillator, motion: PeriodicMotion, share: float, *, before: bool = False, later: int = 0
 ) -> np.ndarray:
     """The state of a motion at a fraction of a period, `share`: the first one after `motion.start`,
     the last one before it (`before`), or that `later` periods after the first."""
     chain = motion.chain
-    states = np.asarray(_passing_states(osc, chain, motion.unknowns, jnp.asarray(share)))
+    states = np.asarray(passing_states(osc, chain, motion.unknowns, jnp.asarray(share)))
     passes = np.flatnonzero(np.isfinite(states[:, 0]))
     # Whether the first of these states is before the first phase 0 of the chain.
     is_first = chain.share is not None and share >= float(chain.share)
@@ -404,14 +413,14 @@ def periods_of(chain: TimedChain) -> int:
     return int(np.max(np.sum(is_end, axis=-1)))
 
 
-_passing_states = jit(states_at_phase)
+passing_states = jit(states_at_phase)
 
 
 def state_at_phase_0(osc: Oscillator, chain: TimedChain, z: Array) -> np.ndarray:
     """The state at the phase 0 by the unknowns of a chain, which need not solve its equations."""
     if chain.share is None:
         return np.asarray(z)[0, :2]
-    return np.asarray(_first_state(_passing_states(osc, chain, z, jnp.zeros(()))))
+    return np.asarray(_first_state(passing_states(osc, chain, z, jnp.zeros(()))))
 
 
 def _first_state(states: Array) -> Array:
