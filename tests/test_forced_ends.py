@@ -146,3 +146,73 @@ def test_a_border_that_symmetric_motions_meet_is_named(phase, unit):
     known = [0.3635, 0.364, 0.3645], [1.495773, 1.492969, 1.490173]
     adding = np.polynomial.Polynomial.fit(*known, 2)
     assert force == pytest.approx(adding(frequency), abs=3e-5)
+
+
+# --- where t is 0 ---------------------------------------------------------------------------------
+
+
+def frequency_of(osc):
+    return osc.forcing[0].frequency
+
+
+def amplitude_of(osc):
+    return osc.forcing[0].amplitude
+
+
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("step", [0.02, 0.05])
+@pytest.mark.parametrize("phase", [0.0, 0.5, -0.5, np.pi])
+@pytest.mark.parametrize("kinetic", [1.0, 0.5])
+def test_a_curve_goes_on_where_the_touch_passes_the_phase_0(kinetic, phase, step):
+    """The motion that slips all the time is x1 = 1/2 + A cos(w t - lag), and touches at A w = 1/2.
+    For the phase 0 it does so at the phase 0 where w = 1."""
+
+    def exact(w):
+        return 0.5 * np.hypot(1 - w**2, 0.1 * w) / w
+
+    belt = jb.Belt(0.5, jb.Coulomb(1.0, kinetic), load=0.5)
+    osc = jb.Oscillator(0.1, (belt,), forcing=jb.Harmonic(0.9 * exact(1.2), 1.2, phase))
+    start = jb.find_cycle(osc, (0.25, 0.0))
+    point = jb.refine(jb.GrazingSliding(0), osc, where=amplitude_of, start=start)
+    both = frequency_of, amplitude_of
+    curve = jb.bifurcation_curve(point, both, ((0.8, 1.3), (0.01, 1.0)), step=step)
+    assert curve.ends == (Stop.LEFT_SPAN, Stop.LEFT_SPAN) and curve.special == ()
+    assert {0.8, 1.3} <= set(curve.values[:, 0].tolist())
+    w, force = curve.values.T
+    np.testing.assert_allclose(force, exact(w), rtol=0, atol=1e-13)
+
+
+@pytest.mark.slow
+def test_a_curve_of_three_periods_does_not_depend_on_where_t_is_0():
+    """For some phases events of its motion pass the phase 0, and other curves pass nearby."""
+
+    def osc(force, phase):
+        law = jb.Coulomb(1.0, 1.0)
+        belts = jb.Belt(2.0, law, load=0.5), jb.Belt(2.0, law, load=0.25, lower=0.75)
+        return jb.Oscillator(0.1, belts, forcing=jb.Harmonic(force, 1.2, phase))
+
+    begun = osc(0.1026, np.pi)
+    start = jb.find_cycle(begun, (0.5, 0.0))
+    known = jb.refine(jb.GrazingEdge(1), begun, where=amplitude_of, start=start)
+    motion = known.cycle
+    assert motion.periods == 3
+    curves = []
+    for phase in (np.pi, 2.1, 0.5 * np.pi, 0.3):
+        later = (phase - np.pi) % (2 * np.pi) / 1.2
+        start = tuple(motion.start.tolist())
+        if later > 0:
+            run = jb.simulate(known.oscillator, start, later, ts=[later])
+            start = tuple(run.ys[0].tolist())
+        begun = osc(0.9999 * float(known.value), phase)
+        point = jb.refine(jb.GrazingEdge(1), begun, where=amplitude_of, start=start)
+        both = frequency_of, amplitude_of
+        curves.append(jb.bifurcation_curve(point, both, ((0.8, 1.3), (0.01, 1.0)), step=0.05))
+    first = curves[0]
+    assert [one.kind for one in first.special] == ["PeriodDoubling", "Fold", "Fold"]
+    for curve in curves[1:]:
+        assert curve.ends == first.ends
+        assert [one.kind for one in curve.special] == [one.kind for one in first.special]
+        values = [one.values for one in curve.special]
+        np.testing.assert_allclose(values, [one.values for one in first.special], atol=1e-11)
+        # The first row is as near to the end as a part of a step.
+        np.testing.assert_allclose(curve.values[[0, -1]], first.values[[0, -1]], atol=5e-5)

@@ -246,6 +246,9 @@ def motions_to_begin_from(osc: OwnOscillator, start: Any, turns: int) -> Sequenc
     """The motions to begin from; for each one of an even number of periods also the motion between
     its halves, which it may have left in a period doubling."""
     if isinstance(start, PeriodicMotion):
+        status = Status(int(start.status))
+        is_motion = status in (Status.OK, Status.NEUTRAL)
+        require(is_motion, "start", "a motion with status OK", status.name)
         return [rescaled(start, 1 / osc.units.length, lambda _: osc)]
     if start is not None:
         start = as_finite(start, "start", (2,))
