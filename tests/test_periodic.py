@@ -1011,6 +1011,6 @@ def test_a_motion_that_was_not_found_is_no_start(condition):
     belt = jb.Belt(0.5, jb.Conti(1.0, 0.6, 10.0))
     osc = jb.Oscillator(0.1, (belt,), forcing=jb.Harmonic(0.5, 1.66))
     start = jb.find_cycle(osc, (0.5, 0.0))
-    assert start.status == Status.NOT_SETTLED
+    assert start.status == jb.Status.NOT_SETTLED
     with pytest.raises(ValueError, match="start must be a motion with status OK, got NOT_SETTLED"):
         jb.refine(condition, osc, where=lambda osc: osc.forcing[0].frequency, start=start)
