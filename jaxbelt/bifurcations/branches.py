@@ -277,13 +277,17 @@ def _points_between(
     for kind in before:
         if not before[kind] * after[kind] < 0:
             continue
-        nearer = min((one, other), key=lambda row: abs(_tests(row.motion)[kind]))
-        found = _points(line, kind(), nearer)
-        if kind is Fold and line.is_symmetric:
-            found = [*_points(line, SymmetryBreaking(), nearer), *found]
         start = np.asarray(other.motion.start)
-        fine = [p for p in found if _is_between(line, p, one, other.value, start)]
-        yield from fine[:1]
+        rows = sorted((one, other), key=lambda row: abs(_tests(row.motion)[kind]))
+        # Where the signature ends the multiplier may jump, and the point be one before.
+        for row in rows if one.motion.signature == other.motion.signature else rows[:1]:
+            found = _points(line, kind(), row)
+            if kind is Fold and line.is_symmetric:
+                found = [*_points(line, SymmetryBreaking(), row), *found]
+            fine = [p for p in found if _is_between(line, p, one, other.value, start)]
+            yield from fine[:1]
+            if fine:
+                break
 
 
 def _points(
