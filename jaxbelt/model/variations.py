@@ -66,7 +66,7 @@ VARIED = "this diagram, scan or set of fractions"
 FOR_FORCED = "jb.bifurcation_diagram(...) of a branch, jb.orbit_diagram or jb.sweep"
 
 
-def _on_line(line: Family, *p: Any) -> Oscillator:
+def _at_parameters(line: Family, *p: Any) -> Oscillator:
     return line.at(jnp.stack(p))
 
 
@@ -103,7 +103,7 @@ class Variation:
         line = Family(jax.tree.unflatten(structure, leaves), tuple(slopes), np.zeros(len(numbers)))
         named = names_of(osc)
         names = tuple(named[number] for number in numbers)
-        return cls(functools.partial(_on_line, line), names, line, varies_leaves=True)
+        return cls(functools.partial(_at_parameters, line), names, line, varies_leaves=True)
 
     @classmethod
     def of_function(
