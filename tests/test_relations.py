@@ -332,6 +332,7 @@ def at_rest_on_an_edge() -> list[tuple[jb.Oscillator, np.ndarray]]:
     ]
 
 
+@pytest.mark.slow(first=True)
 def test_at_rest_on_an_edge_a_reflected_run_is_the_same():
     for osc, y0 in at_rest_on_an_edge():
         left, right = pushes(osc, y0[0])

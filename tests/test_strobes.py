@@ -521,6 +521,7 @@ def test_winding_numbers_of_stick_slip_motions_that_are_pushed():
         assert high - low < 1e-3 and low <= 1 / found.winding.values[row, 1] <= high
 
 
+@pytest.mark.slow(first=True)
 def test_a_mass_that_stops_at_its_maximum_has_one_maximum():
     """Where it comes to rest, x2 at the end of the step is zero up to rounding of either sign."""
     frequencies = np.linspace(0.3, 0.5, 5)

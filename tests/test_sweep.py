@@ -73,7 +73,8 @@ def test_a_mass_at_rest_is_near_no_edge():
     assert (rest.status == Status.OK) & (rest.x1_end == 0) & (rest.x2_end == 0)
 
 
-@pytest.mark.parametrize("observe", ["final", pytest.param("attractor", marks=pytest.mark.slow)])
+@pytest.mark.slow(first=True)
+@pytest.mark.parametrize("observe", ["final", "attractor"])
 def test_a_motion_that_grows_beyond_all_bounds_keeps_nobody_waiting(observe):
     """At 1e103 cubes overflow and steps become ever smaller; so many would be made until t1."""
     belts = jb.presets.class_b(0.3, 0.35).belts
