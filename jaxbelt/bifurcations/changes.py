@@ -25,7 +25,7 @@ from .tracks import Track
 
 #: Distances from a change of signature, in steps, at which the curve beyond it is searched for: it
 #: may bend sharply, or end near there.
-BESIDE_CHANGE = (0.02, 0.1, 0.5)
+BESIDE_CHANGE = (0.5, 0.1, 0.02)
 #: Directions in which it is searched for, in degrees from straight on: it may have a corner there.
 TURNS = (0, 15, -15, 30, -30, 50, -50, 75, -75, 105, -105, 135, -135)
 #: A curve goes back where it came from within 45 degrees.
@@ -191,7 +191,7 @@ def beyond_change(
     reaches = [part * problem.step for part in BESIDE_CHANGE]
     # Where the motion exists only close to the curve, guesses miss it. A curve that goes on crosses
     # a side of the largest square around the change.
-    ways = [*((change.from_guesses, reach) for reach in reaches), (change.from_search, reaches[-1])]
+    ways = [*((change.from_guesses, reach) for reach in reaches), (change.from_search, reaches[0])]
     found = (change.nearest(find(reach), reach) for find, reach in ways)
     return next((one for one in found if one is not None), None)
 
