@@ -279,7 +279,8 @@ def _points_between(
             continue
         start = np.asarray(other.motion.start)
         rows = sorted((one, other), key=lambda row: abs(_tests(row.motion)[kind]))
-        # Where the signature ends the multiplier may jump, and the point be one before.
+        # Between two signatures the multiplier may jump: from the farther motion an earlier point
+        # would be found again.
         for row in rows if one.motion.signature == other.motion.signature else rows[:1]:
             found = _points(line, kind(), row)
             if kind is Fold and line.is_symmetric:

@@ -1,5 +1,6 @@
 """Where the motion of a curve of bifurcation points ceases to exist: `where_it_ends`; and how the
-curve goes on where only its signature changes: `beyond_change`."""
+curve goes on where only its signature changes: `beyond_change`, or where an event passes the phase
+at which its arcs begin: `begun_off_events_at`."""
 
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
@@ -28,7 +29,8 @@ from .tracks import Track
 BESIDE_CHANGE = (0.5, 0.1, 0.02)
 #: Directions in which it is searched for, in degrees from straight on: it may have a corner there.
 TURNS = (0, 15, -15, 30, -30, 50, -50, 75, -75, 105, -105, 135, -135)
-#: A curve goes back where it came from within 45 degrees.
+#: Cosine of the angle, 45 degrees, to where the curve came from, below which a point is on its way
+#: back.
 BACK = 0.7
 #: A point is on the curve behind a change if its own curve comes as near to the change as this, in
 #: steps, on a way that is followed in parts of the distance.
@@ -112,10 +114,7 @@ def begun_off_events_at(
     if hasattr(system, "row"):
         row = jnp.asarray(places[int(system.row)], dtype=jnp.asarray(system.row).dtype)
         system = eqx.tree_at(lambda s: s.row, system, row)
-    system = system.refined(osc, z)
-    weights = system.weights(z)
-    begun = Track(track.variation, system, weights)
-    u = np.append(np.asarray(weights) * np.asarray(z).reshape(-1), last.u[-2:])
+    begun, u = Track.of_system(track.variation, system.refined(osc, z), z, last.u[-2:])
     way = begun.tangent(u)
     return begun, u, way * np.sign(way[-2:] @ last.tangent[-2:])
 

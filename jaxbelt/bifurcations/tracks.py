@@ -71,6 +71,13 @@ class Track(NamedTuple):
     ) -> tuple["Track", np.ndarray]:
         """The track to follow from a point, and u there; pair: both parameters, [2]."""
         system, x = point.condition.applied_to(point.oscillator).system_at(point)
+        return cls.of_system(variation, system, x, pair)
+
+    @classmethod
+    def of_system(
+        cls, variation: Variation, system: AbstractSystem, x: ArrayLike, pair: np.ndarray
+    ) -> tuple["Track", np.ndarray]:
+        """The track of a system with the unknowns x, and u there; pair: both parameters, [2]."""
         weights = system.weights(jnp.asarray(x))
         u = np.append(np.asarray(weights) * np.asarray(x).reshape(-1), pair)
         return cls(variation, system, weights), u
